@@ -1,0 +1,29 @@
+"""Errors a user can mend. Each message is one paragraph that says what to do."""
+
+
+class RaceError(Exception):
+    """Base of every error that is shown to the user as a message, without a traceback."""
+
+
+class ConfigError(RaceError):
+    """A hyperparameter, or a combination of them, that cannot work."""
+
+
+class TaskError(RaceError):
+    """A task that is unknown, or whose description does not fit together."""
+
+
+class RunDirectoryError(RaceError):
+    """A run directory that already holds a run, holds none, or cannot be written."""
+
+
+class CheckpointError(RaceError):
+    """A checkpoint that is missing, corrupted, or was written by another program or version."""
+
+
+class DivergenceError(RaceError):
+    """A loss or a fitness is no longer a finite number."""
+
+
+class RenderError(RaceError):
+    """A video that cannot be made on this machine."""

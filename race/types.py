@@ -1,0 +1,197 @@
+"""The data that flows between environments, learners and algorithms.
+
+Axes and their letters, used in every shape of the project:
+
+==========  =====================================================================
+letter      axis
+==========  =====================================================================
+``B``       samples of a batch
+``N``       agents of a team
+``O``       entries of one agent's observation, padded to the largest agent
+``A``       entries of one agent's action, padded to the largest agent
+``U``       entries of the joint action, all agents, no padding
+``S``       entries of the global state
+``H``       units of an observation embedding z
+``P``       teams of the population
+``T``       teams that act: the population, then the MARL team
+``K``       critics of an ensemble (2 for MATD3, 1 for MADDPG)
+==========  =====================================================================
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from race.errors import TaskError
+
+
+class Transition(NamedTuple):
+    """One step of the environment, or a batch of them (leading axes ``...``).
+
+    Observations are not stored: they are gathered from the states (:class:`EnvSpec`).
+    ``terminated`` is 1 where the task itself ended; a time limit leaves it 0, so that targets
+    bootstrap through it.
+    """
+
+    state: Float[Array, "*b S"] | Float[np.ndarray, "*b S"]
+    action: Float[Array, "*b U"] | Float[np.ndarray, "*b U"]
+    reward: Float[Array, "*b"] | Float[np.ndarray, "*b"]
+    terminated: Float[Array, "*b"] | Float[np.ndarray, "*b"]
+    next_state: Float[Array, "*b S"] | Float[np.ndarray, "*b S"]
+
+
+class Rollout(NamedTuple):
+    """What one batch of episodes brought back to the host, one episode per acting team.
+
+    ``transitions`` hold the steps of all teams in the order they were made: by tick, then by
+    team. ``episode_return`` is the undiscounted sum of rewards.
+    """
+
+    transitions: Transition  # leading axis: steps of all teams
+    episode_return: Float[np.ndarray, "T"]
+    episode_length: NDArray[np.int64]  # [T]
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """Who sees what and who moves what in a task: everything a learner knows of it.
+
+    An environment is an ordinary single-agent `gymnasium.Env` over the global state and the
+    joint action; this factorisation makes it a multi-agent task. Hashable, so it can be a static
+    argument of a compiled function.
+
+    Attributes:
+        task: the task's id.
+        state_size: entries of the global state.
+        obs_index: for each agent, the entries of the state it observes, in its order.
+        action_index: for each agent, the entries of the joint action it controls.
+        action_low: lowest value of each entry of the joint action, in the environment's units.
+        action_high: highest value of each entry.
+        episode_limit: steps after which an episode is cut off (truncated).
+
+    Raises:
+        TaskError: if an index is out of range, or the agents' actions do not cover each entry of
+            the joint action exactly once.
+    """
+
+    task: str
+    state_size: int
+    obs_index: tuple[tuple[int, ...], ...]
+    action_index: tuple[tuple[int, ...], ...]
+    action_low: tuple[float, ...]
+    action_high: tuple[float, ...]
+    episode_limit: int
+
+    def __post_init__(self) -> None:
+        covered = sorted(entry for agent in self.action_index for entry in agent)
+        if covered != list(range(len(self.action_low))):
+            raise TaskError(
+                f"Task {self.task}: each of the {len(self.action_low)} entries of the joint action "
+                f"must belong to exactly one agent, but action_index covers {covered}."
+            )
+        if len(self.obs_index) != len(self.action_index):
+            raise TaskError(
+                f"Task {self.task}: obs_index describes {len(self.obs_index)} agents and "
+                f"action_index {len(self.action_index)}; they must describe the same agents."
+            )
+        if any(not 0 <= e < self.state_size for agent in self.obs_index for e in agent):
+            raise TaskError(
+                f"Task {self.task}: obs_index names entries outside the state of size "
+                f"{self.state_size}."
+            )
+        if not all(self.obs_index) or not all(self.action_index):
+            raise TaskError(
+                f"Task {self.task}: every agent needs at least one observation entry and one "
+                "action entry."
+            )
+        if len(self.action_high) != len(self.action_low) or not all(
+            np.isfinite((low, high)).all() and low < high
+            for low, high in zip(self.action_low, self.action_high, strict=True)
+        ):
+            raise TaskError(
+                f"Task {self.task}: action_low and action_high must be finite, of equal length, "
+                "and low below high."
+            )
+        if self.episode_limit < 1:
+            raise TaskError(f"Task {self.task}: episode_limit must be at least 1.")
+
+    @property
+    def n_agents(self) -> int:
+        """Number of agents N."""
+        return len(self.action_index)
+
+    @property
+    def obs_sizes(self) -> tuple[int, ...]:
+        """Observation entries of each agent."""
+        return tuple(len(agent) for agent in self.obs_index)
+
+    @property
+    def action_sizes(self) -> tuple[int, ...]:
+        """Action entries of each agent."""
+        return tuple(len(agent) for agent in self.action_index)
+
+    @property
+    def obs_size(self) -> int:
+        """Observation entries O after padding to the largest agent."""
+        return max(self.obs_sizes)
+
+    @property
+    def action_size(self) -> int:
+        """Action entries A after padding to the largest agent."""
+        return max(self.action_sizes)
+
+    @property
+    def joint_action_size(self) -> int:
+        """Entries U of the joint action."""
+        return len(self.action_low)
+
+    @cached_property
+    def obs_gather(self) -> NDArray[np.int32]:
+        """State entry of each observation entry, shape [N, O]; padding points at entry 0."""
+        return _padded(self.obs_index, self.obs_size)
+
+    @cached_property
+    def obs_mask(self) -> NDArray[np.bool_]:
+        """True where an observation entry is real and not padding, shape [N, O]."""
+        return np.arange(self.obs_size)[None] < np.array(self.obs_sizes)[:, None]
+
+    @cached_property
+    def action_mask(self) -> NDArray[np.bool_]:
+        """True where an action entry is real and not padding, shape [N, A]."""
+        return np.arange(self.action_size)[None] < np.array(self.action_sizes)[:, None]
+
+    @cached_property
+    def joint_gather(self) -> NDArray[np.int32]:
+        """For each entry of the joint action, its place in the flattened [N * A], shape [U].
+
+        ``padded.reshape(N * A)[joint_gather]`` turns the agents' padded actions into the joint
+        action in the environment's order, without padding.
+        """
+        gather = np.zeros(self.joint_action_size, np.int32)
+        for agent, entries in enumerate(self.action_index):
+            for place, entry in enumerate(entries):
+                gather[entry] = agent * self.action_size + place
+        return gather
+
+
+def _padded(index: tuple[tuple[int, ...], ...], size: int) -> NDArray[np.int32]:
+    return np.array([[*agent, *[0] * (size - len(agent))] for agent in index], np.int32)
+
+
+class Task(NamedTuple):
+    """A task: its factorisation and the way to make its environment.
+
+    ``make(render_mode)`` returns a `gymnasium.Env` whose observation is the global state, a
+    float array of shape [S], and whose action is the joint action, shape [U], in its own units
+    (between ``spec.action_low`` and ``spec.action_high``). Time limits are the environment's
+    ``truncated``. ``render_mode`` is None or ``"rgb_array"``.
+    """
+
+    spec: EnvSpec
+    make: Callable[[str | None], gymnasium.Env[Any, Any]]
