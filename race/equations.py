@@ -1,0 +1,112 @@
+"""Equations (1) to (7) of the paper, one pure function each: arrays in, arrays out.
+
+Shapes are those of one batch; every function can be jitted and vmapped. None of them stops a
+gradient: which parameters an equation trains is decided where it is used, by what is
+differentiated. Symbols are the paper's.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Scalar = Float[Array, ""]
+
+
+def td_target(
+    reward: Float[Array, "B"],
+    terminated: Float[Array, "B"],
+    next_value: Float[Array, "B"],
+    discount: float,
+) -> Float[Array, "B"]:
+    """One-step target ``y = r + gamma (1 - terminated) Q'(s', pi(s'))`` inside Eq. (1).
+
+    Args:
+        reward: r.
+        terminated: 1 where the task ended at s', else 0. A time limit is not an end.
+        next_value: the target network's value of s', ``Q_psi'(s', pi'_marl(s'))`` for the MARL
+            critic or ``Q_theta'(s', pi_j(s'), W_j)`` for the PeVFA.
+        discount: gamma.
+    """
+    return reward + discount * (1.0 - terminated) * next_value
+
+
+def td_loss(value: Float[Array, "K B"], target: Float[Array, "B"]) -> Scalar:
+    """Eq. (1): ``E_D[(y - Q(s, u))^2]``, summed over the K critics of an ensemble.
+
+    L_psi with Q_psi of the MARL critic, L_theta with Q_theta of the PeVFA.
+    """
+    return jnp.sum(jnp.mean(jnp.square(value - target[None]), axis=1))
+
+
+def value_function_maximization_loss(
+    marl_value: Float[Array, "B"], team_value: Float[Array, "B"]
+) -> Scalar:
+    """Eq. (2): ``L_VFM = -E[Q_psi(s, pi_marl(s)) + Q_theta(s, pi_j(s), W_j)]``.
+
+    Args:
+        marl_value: ``Q_psi(s, pi_marl(s))``, the MARL critic of the MARL team's actions.
+        team_value: ``Q_theta(s, pi_j(s), W_j)``, the PeVFA of a population team's actions.
+    """
+    return -jnp.mean(marl_value + team_value)
+
+
+def mutual_information_signal(scores: Float[Array, "B B"]) -> Float[Array, "B"]:
+    """The per-step signal ``I_t(z_t, s_t)`` below Eq. (3).
+
+    ``I_t = -sp(-T(s_t, z_t)) - E_{k != t}[sp(T(s_t, z_k))]`` with ``sp(x) = log(1 + exp(x))``.
+    The embeddings of the other samples of the batch stand for the product of the marginals.
+
+    Args:
+        scores: ``T_omega(s_t, z_k)``, row t the state, column k the embedding; B at least 2.
+    """
+    n = scores.shape[0]
+    paired = jnp.diagonal(scores)
+    negative = jax.nn.softplus(scores)
+    unpaired = jnp.sum(negative, axis=1) - jnp.diagonal(negative)
+    return -jax.nn.softplus(-paired) - unpaired / (n - 1)
+
+
+def mutual_information_bound(scores: Float[Array, "B B"]) -> Scalar:
+    """Eq. (3): the lower bound ``I_lb(z; s)``, the mean of the per-step signals."""
+    return jnp.mean(mutual_information_signal(scores))
+
+
+def best_target(
+    marl_target: Float[Array, "B"], team_target: Float[Array, "B"]
+) -> Float[Array, "B"]:
+    """``F(s)`` of Eq. (4): the larger of the two targets that Eq. (1) computed.
+
+    The paper writes ``r + max(Q_psi', Q_theta')``; the discount and the termination that Eq. (1)
+    puts between r and Q' are taken to be meant here too.
+    """
+    return jnp.maximum(marl_target, team_target)
+
+
+def state_value_loss(value: Float[Array, "B"], target: Float[Array, "B"]) -> Scalar:
+    """Eq. (4): ``L_zeta = E_D[(V_zeta(s) - F(s))^2]``."""
+    return jnp.mean(jnp.square(value - target))
+
+
+def value_weights(value: Float[Array, "B"]) -> Float[Array, "B"]:
+    """The min-max normalised state values of Eq. (5), in [0, 1].
+
+    Equal values, for which the paper's fraction is 0/0, all get weight 0.
+    """
+    low, high = jnp.min(value), jnp.max(value)
+    spread = high - low
+    return (value - low) / jnp.where(spread > 0, spread, jnp.ones_like(spread))
+
+
+def value_aware_mi_loss(weights: Float[Array, "B"], signal: Float[Array, "B"]) -> Scalar:
+    """Eq. (5): ``L_VMM = -E_D[w(s_t) I_t(z_t, s_t)]`` with the weights of `value_weights`."""
+    return -jnp.mean(weights * signal)
+
+
+def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: float) -> Scalar:
+    """Eq. (6): ``L_phi = L_VFM + beta L_VMM``."""
+    return vfm + vmm_weight * vmm
+
+
+def marl_policy_loss(marl_value: Float[Array, "B"]) -> Scalar:
+    """Eq. (7): ``L_MARL(W_marl) = -E_D[Q_psi(s, pi_marl(s))]``."""
+    return -jnp.mean(marl_value)
