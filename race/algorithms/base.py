@@ -1,0 +1,38 @@
+"""The interface of an algorithm."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Float
+
+Losses = dict[str, Float[Array, ""]]
+
+
+class Teams(NamedTuple):
+    """All acting teams: the population first, the MARL team last."""
+
+    encoder: Any
+    heads: Float[Array, "T N H1 A"]
+
+
+class Algorithm(NamedTuple):
+    """Pure functions over one state pytree. ``spec`` and ``config`` are static."""
+
+    init: Callable[..., Any]
+    """(key, spec, config) -> state."""
+    teams: Callable[[Any], Teams]
+    """state -> the teams that act."""
+    champion: Callable[[Any], Float[Array, "N H1 A"]]
+    """state -> heads of the team of best training fitness."""
+    evolve: Callable[..., Any]
+    """(state, fitness [P], key, spec, config) -> state; lines 9 of Algorithm 1."""
+    update: Callable[..., tuple[Any, Losses, Losses]]
+    """(state, batch, step, key, spec, config) -> state, critic losses, policy losses; lines 8,
+    10 and 13. Policy losses are zero on steps where the policy delay idles."""
+    inject: Callable[[Any], Any]
+    """state -> state; line 11."""
+    injection_counts: Callable[[Any], Array | np.ndarray]
+    """state -> how often the injected team became elite, parent, discarded; shape [3]."""
+    critic_losses: tuple[str, ...]
+    policy_losses: tuple[str, ...]

@@ -1,0 +1,303 @@
+"""RACE: a MARL team and a population of teams over shared observation encoders.
+
+Written once against the learner's interface. Lines are those of Algorithm 1 of the paper, whose
+one iteration is: roll out all teams (3-6), evolve (9), then for each minibatch train the critics
+(8), the MARL team (10) and the encoders (13), then inject the MARL team (11).
+
+The paper lists 8 before 9 and trains each part once per iteration; like the code it builds on,
+the parts are interleaved minibatch by minibatch here, and evolution comes first, so that the
+PeVFA learns the values of the teams that act next.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from race.algorithms.base import Algorithm, Losses, Teams
+from race.config import Config
+from race.critics import init_state_value, state_values
+from race.equations import (
+    best_target,
+    encoder_loss,
+    marl_policy_loss,
+    mutual_information_signal,
+    state_value_loss,
+    td_loss,
+    td_target,
+    value_aware_mi_loss,
+    value_function_maximization_loss,
+    value_weights,
+)
+from race.genetics import breed, inject, mutate_population, select
+from race.learners import LEARNERS
+from race.networks import init_mine, mine_scores
+from race.optimization import copy, descend, init_trainable, track
+from race.types import EnvSpec, Transition
+
+
+class Targets(NamedTuple):
+    """Target networks, marked by a prime in the paper. Population teams have none."""
+
+    encoder: Any
+    head: Float[Array, "N H1 A"]
+    critic: Any
+    pevfa: Any
+
+
+class Critics(NamedTuple):
+    """What line 8 trains, or its gradients."""
+
+    critic: Any  # Q_psi
+    pevfa: Any  # Q_theta
+    value: Any  # V_zeta
+
+
+class Policies(NamedTuple):
+    """What lines 10 and 13 train, or its gradients."""
+
+    encoder: Any  # Z_phi
+    head: Any  # W_marl
+    mine: Any  # T_omega
+
+
+class RaceState(NamedTuple):
+    """All that learns and evolves."""
+
+    policies: Policies  # of Trainable
+    critics: Critics  # of Trainable
+    target: Targets
+    heads: Float[Array, "P N H1 A"]  # the population
+    elite: Int[Array, ""]
+    worst: Int[Array, ""]
+    injected: Int[Array, ""]  # where the MARL team was put last, -1 before the first time
+    injection_counts: Int[Array, "3"]  # elite, parent, discarded
+
+
+def init(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> RaceState:
+    """Line 1."""
+    learner, hyper, race = LEARNERS[config.base], config.learner, config.race
+    keys = jax.random.split(key, 7)
+    encoder = learner.init_encoder(keys[0], spec, hyper)
+    head = learner.init_head(keys[1], spec, hyper)
+    critic = learner.init_critic(keys[2], spec, hyper)
+    pevfa = learner.init_pevfa(keys[3], spec, hyper, race.policy_embedding_size)
+    value = init_state_value(keys[4], spec, hyper.hidden_sizes)
+    mine = init_mine(keys[5], spec, hyper.hidden_sizes[1], race.mine_size)
+    heads = [
+        learner.init_head(team_key, spec, hyper)
+        for team_key in jax.random.split(keys[6], race.population_size)
+    ]
+    return RaceState(
+        policies=Policies(*map(init_trainable, (encoder, head, mine))),
+        critics=Critics(*map(init_trainable, (critic, pevfa, value))),
+        target=copy(Targets(encoder, head, critic, pevfa)),
+        heads=jnp.stack(heads),
+        elite=jnp.zeros((), jnp.int32),
+        worst=jnp.zeros((), jnp.int32),
+        injected=jnp.full((), -1, jnp.int32),
+        injection_counts=jnp.zeros(3, jnp.int32),
+    )
+
+
+def teams(state: RaceState) -> Teams:
+    """The population and, last, the MARL team, all over the same encoders."""
+    heads = jnp.concatenate([state.heads, state.policies.head.params[None]])
+    return Teams(state.policies.encoder.params, heads)
+
+
+def evolve(
+    state: RaceState,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    spec: EnvSpec,
+    config: Config,
+) -> RaceState:
+    """Line 9: selection, agent-level crossover and mutation; and what became of the injected."""
+    race = config.race
+    assert race.mutation_fraction is not None
+    select_key, breed_key, mutate_key = jax.random.split(key, 3)
+    chosen = select(fitness, race.tournament_size, select_key)
+    heads = breed(state.heads, chosen, breed_key)
+    heads = mutate_population(
+        heads,
+        chosen.elite,
+        jnp.asarray(spec.action_mask),
+        race.mutation_fraction,
+        race.mutation_probability,
+        race.agent_mutation_probability,
+        mutate_key,
+    )
+    is_elite = state.injected == chosen.elite
+    is_parent = state.injected == chosen.parent
+    is_discarded = (state.injected >= 0) & ~is_elite & ~is_parent
+    fate = jnp.stack([is_elite, is_parent, is_discarded]).astype(jnp.int32)
+    return state._replace(
+        heads=heads,
+        elite=chosen.elite.astype(jnp.int32),
+        worst=chosen.worst.astype(jnp.int32),
+        injection_counts=state.injection_counts + fate,
+    )
+
+
+def update(
+    state: RaceState,
+    batch: Transition,
+    step: Int[Array, ""],
+    key: PRNGKeyArray,
+    spec: EnvSpec,
+    config: Config,
+) -> tuple[RaceState, Losses, Losses]:
+    """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
+    team_key, marl_key, smooth_key = jax.random.split(key, 3)
+    team = state.heads[jax.random.randint(team_key, (), 0, config.race.population_size)]
+    state, critic_losses, value = _train_critics(
+        state, batch, team, (marl_key, smooth_key), spec, config
+    )
+
+    def policy_step(state: RaceState) -> tuple[RaceState, Losses]:
+        return _train_policies(state, batch, team, value, spec, config)
+
+    def idle(state: RaceState) -> tuple[RaceState, Losses]:
+        return state, {name: jnp.zeros(()) for name in POLICY_LOSSES}
+
+    delay_over = (step + 1) % config.learner.policy_delay == 0
+    state, policy_losses = jax.lax.cond(delay_over, policy_step, idle, state)
+    return state, critic_losses, policy_losses
+
+
+def _train_critics(
+    state: RaceState,
+    batch: Transition,
+    team: Float[Array, "N H1 A"],
+    keys: tuple[PRNGKeyArray, PRNGKeyArray],
+    spec: EnvSpec,
+    config: Config,
+) -> tuple[RaceState, Losses, Float[Array, "B"]]:
+    """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch."""
+    learner, hyper, target = LEARNERS[config.base], config.learner, state.target
+
+    # One pass of the target encoders serves both teams. Eq. (1) gives a prime to the MARL team's
+    # policies alone; W_j has no slowly moving copy, but the encoder below it has.
+    z_next = learner.encode(target.encoder, spec, batch.next_state)
+    marl_action = learner.smooth(learner.act(z_next, target.head, spec), keys[0], hyper)
+    team_action = learner.smooth(learner.act(z_next, team, spec), keys[1], hyper)
+    marl_next = learner.q_marl(target.critic, batch.next_state, marl_action)
+    team_next = learner.q_team(target.pevfa, spec, batch.next_state, team_action, team)
+    y_marl, y_team = (
+        td_target(batch.reward, batch.terminated, learner.pessimistic(q), hyper.discount)
+        for q in (marl_next, team_next)
+    )
+    best = best_target(y_marl, y_team)
+
+    def loss(critics: Critics) -> tuple[Float[Array, ""], tuple[Losses, Float[Array, "B"]]]:
+        value = state_values(critics.value, batch.state)
+        losses = {
+            "critic": td_loss(learner.q_marl(critics.critic, batch.state, batch.action), y_marl),
+            "pevfa": td_loss(
+                learner.q_team(critics.pevfa, spec, batch.state, batch.action, team), y_team
+            ),
+            "value": state_value_loss(value, best),
+        }
+        # The three share no parameter: the gradient of the sum is each one's own.
+        return losses["critic"] + losses["pevfa"] + losses["value"], (losses, value)
+
+    params = Critics(*(trained.params for trained in state.critics))
+    gradient, (losses, value) = jax.grad(loss, has_aux=True)(params)
+    critics = Critics(
+        *(
+            descend(trained, g, hyper.critic_learning_rate, hyper.gradient_clip)
+            for trained, g in zip(state.critics, gradient, strict=True)
+        )
+    )
+    return state._replace(critics=critics), losses, value
+
+
+def _train_policies(
+    state: RaceState,
+    batch: Transition,
+    team: Float[Array, "N H1 A"],
+    value: Float[Array, "B"],
+    spec: EnvSpec,
+    config: Config,
+) -> tuple[RaceState, Losses]:
+    """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE."""
+    learner, hyper, race = LEARNERS[config.base], config.learner, config.race
+    assert race.vmm_weight is not None
+    beta = race.vmm_weight
+    critic = learner.first_critic(state.critics.critic.params)
+    pevfa = learner.first_pevfa(state.critics.pevfa.params)
+    weights = value_weights(value)
+
+    def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
+        z = learner.encode(policies.encoder, spec, batch.state)
+        marl_action = learner.act(z, policies.head, spec)
+        team_action = learner.act(z, team, spec)
+        q_marl = learner.q_marl(critic, batch.state, marl_action)[0]
+        q_team = learner.q_team(pevfa, spec, batch.state, team_action, team)[0]
+        signal_of = jax.vmap(mutual_information_signal)
+        # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
+        # held fixed. Both products are the same numbers and are computed once.
+        fixed_mine = jax.lax.stop_gradient(policies.mine)
+        signal = signal_of(mine_scores(fixed_mine, batch.state, z))
+        bound = signal_of(mine_scores(policies.mine, batch.state, jax.lax.stop_gradient(z)))
+        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0))(weights, signal)
+        vfm = value_function_maximization_loss(q_marl, q_team)
+        mine = -jnp.mean(bound, axis=1)
+        # Agents share no encoder and no MINE, so sums over agents train each on its own terms.
+        # W_marl enters through q_marl alone: its gradient is that of Eq. (7).
+        total = encoder_loss(vfm, jnp.sum(vmm), beta) + jnp.sum(mine)
+        losses = {
+            "policy": marl_policy_loss(q_marl),
+            "vfm": vfm,
+            "vmm": jnp.mean(vmm),
+            "mine": jnp.mean(mine),
+        }
+        return total, losses
+
+    params = Policies(*(trained.params for trained in state.policies))
+    gradient, losses = jax.grad(loss, has_aux=True)(params)
+    rates = Policies(
+        hyper.actor_learning_rate, hyper.actor_learning_rate, hyper.critic_learning_rate
+    )
+    policies = Policies(*map(descend, state.policies, gradient, rates, [hyper.gradient_clip] * 3))
+    online = Targets(
+        policies.encoder.params,
+        policies.head.params,
+        state.critics.critic.params,
+        state.critics.pevfa.params,
+    )
+    target = track(state.target, online, hyper.target_update_rate)
+    return state._replace(policies=policies, target=target), losses
+
+
+def inject_marl(state: RaceState) -> RaceState:
+    """Line 11: the MARL team replaces the team of lowest fitness (never the elite)."""
+    heads = inject(state.heads, state.policies.head.params, state.worst)
+    return state._replace(heads=heads, injected=state.worst)
+
+
+def _champion(state: RaceState) -> Float[Array, "N H1 A"]:
+    return state.heads[state.elite]
+
+
+def _injection_counts(state: RaceState) -> Int[Array, "3"]:
+    return state.injection_counts
+
+
+CRITIC_LOSSES = ("critic", "pevfa", "value")
+POLICY_LOSSES = ("policy", "vfm", "vmm", "mine")
+
+race = Algorithm(
+    init=init,
+    teams=teams,
+    champion=_champion,
+    evolve=evolve,
+    update=update,
+    inject=inject_marl,
+    injection_counts=_injection_counts,
+    critic_losses=CRITIC_LOSSES,
+    policy_losses=POLICY_LOSSES,
+)
+"""RACE over any learner."""

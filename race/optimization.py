@@ -1,0 +1,39 @@
+"""Gradient steps: a network with its optimiser's state, clipping, target networks."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+
+class Trainable(NamedTuple):
+    """A network's parameters and the state of its own optimiser."""
+
+    params: Any
+    optimizer: optax.OptState
+
+
+def _adam(learning_rate: float, clip: float) -> optax.GradientTransformation:
+    return optax.chain(optax.clip_by_global_norm(clip), optax.adam(learning_rate))
+
+
+def init_trainable(params: Any) -> Trainable:
+    """A network before its first step. Adam's first state depends on no hyperparameter."""
+    return Trainable(params, _adam(1.0, 1.0).init(params))
+
+
+def descend(trained: Trainable, gradient: Any, learning_rate: float, clip: float) -> Trainable:
+    """One Adam step along a gradient whose global norm is first clipped to ``clip``."""
+    updates, optimizer = _adam(learning_rate, clip).update(gradient, trained.optimizer)
+    return Trainable(optax.apply_updates(trained.params, updates), optimizer)
+
+
+def track(target: Any, online: Any, rate: float) -> Any:
+    """Moves a target network towards the online one: ``target + rate (online - target)``."""
+    return jax.tree.map(lambda t, o: t + rate * (o - t), target, online)
+
+
+def copy(params: Any) -> Any:
+    """The same values in buffers of their own, so that both can be donated to a program."""
+    return jax.tree.map(jnp.copy, params)
