@@ -1,0 +1,201 @@
+"""Tasks: Multi-Agent MuJoCo, probes with known answers, and your own."""
+
+import difflib
+import importlib
+import inspect
+import re
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from race.config import EnvConfig
+from race.envs import mamujoco, probe
+from race.errors import TaskError
+from race.types import EnvSpec, Task
+
+__all__ = ["TaskInfo", "describe_tasks", "factorised", "make_task", "task_ids"]
+
+_PAPER_NAMES: Final = {
+    "mamujoco/HalfCheetah-2x3": "2-Agent HalfCheetah",
+    "mamujoco/HalfCheetah-6x1": "6-Agent HalfCheetah",
+    "mamujoco/Ant-2x4": "2-Agent Ant",
+    "mamujoco/Ant-2x4d": "2-Agent Ant-v2",
+    "mamujoco/Ant-4x2": "4-Agent Ant",
+    "mamujoco/Hopper-3x1": "3-Agent Hopper",
+    "mamujoco/Humanoid-9x8": "2-Agent Humanoid",
+    "mamujoco/HumanoidStandup-9x8": "2-Agent HumanoidStandup",
+}
+_DEFAULT: Final = EnvConfig()
+
+
+class TaskInfo(NamedTuple):
+    """A line of the list of tasks. ``paper_name`` is None where the paper does not use the task."""
+
+    id: str
+    description: str
+    paper_name: str | None
+
+
+def describe_tasks() -> tuple[TaskInfo, ...]:
+    """All tasks that have a name: the paper's eight, other MuJoCo ones, then probes."""
+    known = [f"mamujoco/{s}-{p}" for s, ps in mamujoco.KNOWN_PARTITIONS.items() for p in ps]
+    others = [name for name in known if name not in _PAPER_NAMES]
+    return (
+        *(TaskInfo(name, _describe(name), _PAPER_NAMES[name]) for name in _PAPER_NAMES),
+        *(TaskInfo(name, _describe(name), None) for name in others),
+        *(TaskInfo(name, info.description, None) for name, info in probe.PROBES.items()),
+    )
+
+
+def task_ids() -> tuple[str, ...]:
+    """The ids of `describe_tasks`, in its order."""
+    return tuple(info.id for info in describe_tasks())
+
+
+def _describe(name: str) -> str:
+    scenario, partition = name.removeprefix("mamujoco/").split("-")
+    match partition:
+        case "9x8":
+            return f"{scenario}: upper body (9 joints) and lower body (8)"
+        case "3p":
+            return f"{scenario}: shoulder (3 joints), elbow (1) and wrist (3)"
+        case "2x4":
+            return f"{scenario}: 2 agents, 4 joints each, neighbouring legs together"
+        case "2x4d":
+            return f"{scenario}: 2 agents, 4 joints each, diagonal legs together"
+    agents, each = partition.split("x")
+    part = "segment" if scenario.startswith("ManySegment") else "joint"
+    return f"{scenario}: {agents} agents, {each} {part}{'s' if each != '1' else ''} each"
+
+
+def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
+    """The task of an id.
+
+    Args:
+        task_id: one of `task_ids`; any ``mamujoco/<Scenario>-<partition>`` that
+            gymnasium-robotics knows; or your own as ``package.module:function``, where the
+            function, called without arguments (or with `config`, if it takes one), returns a
+            `Task`. The module is also looked for in the current directory.
+        config: what agents of Multi-Agent MuJoCo observe; its defaults, if not given.
+
+    Raises:
+        TaskError: if there is no such task; the message names the nearest ones.
+    """
+    if re.fullmatch(r"[\w.]+:\w+", task_id):
+        return _own_task(task_id, config)
+    if task_id.startswith("mamujoco/"):
+        return mamujoco.make_task(task_id, config)
+    if task_id in probe.PROBES:
+        return probe.make_task(task_id)
+    nearest = difflib.get_close_matches(task_id, task_ids(), n=3, cutoff=0.0)
+    raise TaskError(
+        f"There is no task {task_id!r}. The nearest names are {', '.join(nearest)}; `race list` "
+        "shows all, and a task of your own is named package.module:function."
+    )
+
+
+def _own_task(task_id: str, config: EnvConfig) -> Task:
+    module_name, function_name = task_id.split(":")
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
+            raise TaskError(
+                f"Task {task_id}: importing {module_name} failed, because it needs the module "
+                f"{error.name}, which is not installed."
+            ) from error
+        raise TaskError(
+            f"Task {task_id}: there is no module {error.name}. It is looked for in the current "
+            f"directory ({Path.cwd()}) and among the installed packages; the name is that of the "
+            "file without .py, with dots for folders."
+        ) from error
+    except Exception as error:
+        raise TaskError(
+            f"Task {task_id}: importing {module_name} failed with {type(error).__name__}: {error}."
+        ) from error
+    function = getattr(module, function_name, None)
+    if not callable(function):
+        raise TaskError(
+            f"Task {task_id}: {module_name} ({module.__file__}) has no function {function_name}. "
+            "Define one that returns a race.types.Task, for example with race.envs.factorised."
+        )
+    task = function(config) if inspect.signature(function).parameters else function()
+    if not isinstance(task, Task):
+        raise TaskError(
+            f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "
+            "race.types.Task; race.envs.factorised builds one from a gymnasium environment."
+        )
+    return task
+
+
+def factorised(
+    make: Callable[[str | None], gymnasium.Env[Any, Any]],
+    *,
+    obs_index: Sequence[Sequence[int]],
+    action_index: Sequence[Sequence[int]],
+    task: str,
+    episode_limit: int | None = None,
+) -> Task:
+    """A task out of a gymnasium environment: who sees which entries, who moves which.
+
+    Args:
+        make: ``make(render_mode)`` returns the environment, with an observation of shape [S] (the
+            global state) and an action of shape [U] (the joint action). Let it be a function of a
+            module: worker processes import it by name.
+        obs_index: for each agent, the entries of the state it observes.
+        action_index: for each agent, the entries of the joint action it moves; every entry must
+            belong to exactly one agent.
+        task: the name of the task.
+        episode_limit: steps after which the environment truncates an episode. None: the limit
+            that the environment was registered with. This describes the environment's own limit
+            and imposes none.
+
+    Raises:
+        TaskError: if spaces are not flat boxes, actions are unbounded, no limit is known, or the
+            indices do not fit.
+    """
+    env = make(None)
+    try:
+        state_size = _flat_box(env.observation_space, "observation", task).shape[0]
+        actions = _flat_box(env.action_space, "action", task)
+        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
+            raise TaskError(
+                f"Task {task}: the action space {actions} has no finite bounds. Give each entry a "
+                "lowest and a highest value, for example with gymnasium.wrappers.RescaleAction or "
+                "in the environment's Box."
+            )
+        if episode_limit is None:
+            episode_limit = env.spec.max_episode_steps if env.spec is not None else None
+        if episode_limit is None:
+            raise TaskError(
+                f"Task {task}: the environment is registered with no time limit. Wrap it in "
+                "gymnasium.wrappers.TimeLimit and pass the same number as episode_limit."
+            )
+    finally:
+        env.close()
+    spec = EnvSpec(
+        task=task,
+        state_size=state_size,
+        obs_index=tuple(tuple(map(int, agent)) for agent in obs_index),
+        action_index=tuple(tuple(map(int, agent)) for agent in action_index),
+        action_low=tuple(actions.low.tolist()),
+        action_high=tuple(actions.high.tolist()),
+        episode_limit=episode_limit,
+    )
+    return Task(spec, make)
+
+
+def _flat_box(space: Any, what: str, task: str) -> gymnasium.spaces.Box:
+    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
+        return space
+    raise TaskError(
+        f"Task {task}: the {what} space must be a Box with one axis, and it is {space}. "
+        "gymnasium.wrappers.FlattenObservation flattens observations; discrete actions are not "
+        "supported."
+    )
