@@ -8,7 +8,7 @@ import time
 import warnings
 from collections.abc import Callable
 from types import TracebackType
-from typing import Any, Final, Self, final
+from typing import Any, Final, final
 
 import gymnasium
 import numpy as np
@@ -150,7 +150,7 @@ class EnvPool:
         where = f", environment {team}" if team is not None else ""
         error.add_note(f"This happened in {what} of the environment of {self.spec.task}{where}.")
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "EnvPool":
         return self
 
     def __exit__(
