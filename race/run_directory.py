@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 
+from race import __version__
 from race import config as configs
 from race.config import Config
 from race.errors import ConfigError, RunDirectoryError
@@ -82,9 +83,9 @@ def create(
         f"{path} already holds a run. Continue it with `race resume {path}`, or choose another "
         "directory with `--run-dir`."
     )
-    if any(part.exists() for part in (run.config, run.metrics, run.checkpoints)):
-        raise occupied
     try:
+        if any(part.exists() for part in (run.config, run.metrics, run.checkpoints)):
+            raise occupied
         path.mkdir(parents=True, exist_ok=True)
         text = _json(metadata(environment or {}))
         # Whoever gets config.json there first owns the directory; only then is the rest written.
@@ -112,7 +113,10 @@ def open_run(path: Path) -> Config:
     """
     file = RunDirectory(path).config
     try:
-        return configs.from_json(json.loads(file.read_text(encoding="utf-8")))
+        data = json.loads(file.read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise ValueError("no object")
+        return configs.from_json(data)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise RunDirectoryError(
             f"{path} is not the directory of a run: it has no config.json. Give the directory that "
@@ -129,7 +133,7 @@ def open_run(path: Path) -> Config:
         ) from error
     except ValueError as error:
         raise RunDirectoryError(
-            f"{file} is not valid JSON ({error}), so it was damaged or edited. Put it back from a "
+            f"{file} is no JSON object ({error}), so it was damaged or edited. Put it back from a "
             "copy, or start the run anew in another directory."
         ) from error
 
@@ -214,6 +218,7 @@ def metadata(environment: Mapping[str, Any]) -> dict[str, Any]:
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
         "environment": dict(environment),
+        "race": __version__,
         "versions": _versions(),
         "git": _git(Path(__file__).resolve().parent),
         "python": platform.python_version(),
