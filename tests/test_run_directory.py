@@ -1,7 +1,6 @@
 import dataclasses
 import importlib.metadata
 import json
-import multiprocessing
 import os
 import signal
 import subprocess
@@ -160,10 +159,10 @@ def test_folders_that_are_no_run_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("", "not valid JSON"),
-        ('{"task": ', "not valid JSON"),
-        ("\xff", "not valid JSON"),
-        ("[]", "does not fit"),
+        ("", "no JSON object"),
+        ('{"task": ', "no JSON object"),
+        ("\xff", "no JSON object"),
+        ("[]", "no JSON object"),
         ('{"task": "a"}', "does not fit"),
     ],
 )
@@ -236,19 +235,35 @@ def test_the_lock_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
         assert RunDirectory(tmp_path).lock.read_text() == f"{os.getpid()}\n"
 
 
-@pytest.mark.filterwarnings("ignore:.*fork:RuntimeWarning", "ignore:.*fork:DeprecationWarning")
-def test_a_forked_child_that_lives_on_does_not_keep_the_lock(tmp_path: Path) -> None:
-    release, wait = multiprocessing.Pipe()
-    with lock(tmp_path):
-        child = multiprocessing.get_context("fork").Process(target=wait.recv)
-        child.start()
-    try:
-        assert child.is_alive()
+FORKS_AND_IS_KILLED = """
+import os, signal, sys
+from pathlib import Path
+from race.run_directory import lock
+with lock(Path(sys.argv[1])):
+    if os.fork() == 0:
+        print("forked", flush=True)
+        sys.stdin.read()
+        os._exit(0)
+    signal.pause()
+"""
+
+
+def test_a_child_that_outlives_a_killed_process_does_not_keep_the_lock(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", FORKS_AND_IS_KILLED, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    with process.stdin, process.stdout:
+        assert process.stdout.readline() == b"forked\n"
+        with pytest.raises(RunDirectoryError), lock(tmp_path):
+            pytest.fail("locked twice")
+        process.send_signal(signal.SIGKILL)
+        process.wait()
         with lock(tmp_path):
             pass
-    finally:
-        release.send("end")
-        child.join()
 
 
 def test_a_missing_directory_cannot_be_locked(tmp_path: Path) -> None:
