@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from race.errors import TaskError
@@ -39,11 +39,11 @@ class Transition(NamedTuple):
     bootstrap through it.
     """
 
-    state: Float[Array, "*b S"] | Float[np.ndarray, "*b S"]
-    action: Float[Array, "*b U"] | Float[np.ndarray, "*b U"]
-    reward: Float[Array, "*b"] | Float[np.ndarray, "*b"]
-    terminated: Float[Array, "*b"] | Float[np.ndarray, "*b"]
-    next_state: Float[Array, "*b S"] | Float[np.ndarray, "*b S"]
+    state: Float[Any, "*b S"]
+    action: Float[Any, "*b U"]
+    reward: Float[Any, "*b"]
+    terminated: Float[Any, "*b"]
+    next_state: Float[Any, "*b S"]
 
 
 class Rollout(NamedTuple):

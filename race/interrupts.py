@@ -1,0 +1,42 @@
+"""Ctrl-C and SIGTERM as a request: what is under way is finished and saved first."""
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any, Self, final
+
+
+@final
+class Interrupts:
+    """Turns the first SIGINT or SIGTERM within a ``with`` block into `requested`.
+
+    A second one interrupts at once, as if there were no handler. Outside the main thread, where
+    Python delivers no signals, it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._previous[number] = signal.signal(number, self._request)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._restore()
+
+    def _request(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        self._restore()
+
+    def _restore(self) -> None:
+        while self._previous:
+            number, handler = self._previous.popitem()
+            signal.signal(number, handler)

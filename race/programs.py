@@ -1,0 +1,120 @@
+"""The compiled programs of a run. Each is traced once per run; `TRACES` counts it."""
+
+from collections import Counter
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from race.algorithms import Algorithm
+from race.algorithms.base import Losses, Teams
+from race.config import Config
+from race.learners import LEARNERS
+from race.networks import act_teams
+from race.replay import Replay, insert, sample
+from race.types import EnvSpec, Transition
+
+TRACES: Counter[str] = Counter()
+"""How often each program was traced in this process: one more than expected is a slow surprise."""
+
+INSERT_ROWS = 2048
+"""Transitions written to the replay buffer at a time."""
+
+
+def empty_losses(algorithm: Algorithm) -> Losses:
+    """Sums of losses before the first gradient step of a generation."""
+    names = (*algorithm.critic_losses, *algorithm.policy_losses)
+    return {name: jnp.zeros(()) for name in names}
+
+
+@partial(
+    jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames=("state", "sums")
+)
+def learn(
+    state: Any,
+    sums: Losses,
+    replay: Replay,
+    key: PRNGKeyArray,
+    first_step: Int[Array, ""],
+    n_steps: Int[Array, ""],
+    *,
+    algorithm: Algorithm,
+    spec: EnvSpec,
+    config: Config,
+) -> tuple[Any, Losses]:
+    """Gradient steps ``first_step`` to ``first_step + n_steps - 1`` of a run, in one program.
+
+    The randomness of a step depends on ``key`` and the step's number alone, so that steps may be
+    split over calls in any way.
+
+    Returns:
+        The state and ``sums`` with the steps' losses added.
+    """
+    TRACES["learn"] += 1
+
+    def body(i: Int[Array, ""], carry: tuple[Any, Losses]) -> tuple[Any, Losses]:
+        state, sums = carry
+        step = first_step + i
+        sample_key, update_key = jax.random.split(jax.random.fold_in(key, step))
+        batch = sample(replay, config.learner.batch_size, sample_key)
+        state, critic, policy = algorithm.update(state, batch, step, update_key, spec, config)
+        losses = critic | policy
+        return state, {name: sums[name] + losses[name] for name in sums}
+
+    return jax.lax.fori_loop(0, n_steps, body, (state, sums))
+
+
+@partial(jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames="state")
+def evolve(
+    state: Any,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    *,
+    algorithm: Algorithm,
+    spec: EnvSpec,
+    config: Config,
+) -> Any:
+    """One evolution of the population."""
+    TRACES["evolve"] += 1
+    return algorithm.evolve(state, fitness, key, spec, config)
+
+
+@partial(jax.jit, donate_argnames="replay")
+def store(replay: Replay, rows: Transition, count: Int[Array, ""]) -> Replay:
+    """Writes up to `INSERT_ROWS` transitions."""
+    TRACES["store"] += 1
+    return insert(replay, rows, count)
+
+
+@partial(jax.jit, static_argnames=("spec", "base", "noise"))
+def act(
+    teams: Teams,
+    state: Float[Array, "T S"],
+    key: PRNGKeyArray,
+    tick: Int[Array, ""],
+    *,
+    spec: EnvSpec,
+    base: str,
+    noise: float,
+) -> Float[Array, "T U"]:
+    """The joint actions of all teams, each in its own state: one batched call per tick.
+
+    With ``noise`` the last team, the MARL team, explores with Gaussian noise of that standard
+    deviation; the population explores by its diversity. Without, ``key`` is not used.
+    """
+    TRACES[f"act, noise {noise}"] += 1
+    z = LEARNERS[base].encode(teams.encoder, spec, state)
+    action = act_teams(z, teams.heads, spec)
+    if noise == 0:
+        return action
+    exploration = noise * jax.random.normal(jax.random.fold_in(key, tick), action.shape[1:])
+    return action.at[-1].set(jnp.clip(action[-1] + exploration, -1.0, 1.0))
+
+
+@partial(jax.jit, static_argnames=("algorithm", "spec", "config"))
+def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: EnvSpec, config: Config) -> Any:
+    """The state of an algorithm before its first step."""
+    TRACES["start"] += 1
+    return algorithm.init(key, spec, config)

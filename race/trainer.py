@@ -1,0 +1,439 @@
+"""The training loop: generations of Algorithm 1, with metrics, evaluations and checkpoints.
+
+Everything that changes is one `RunState`; a generation maps it to the next. All randomness is
+drawn by purpose and counter from the run's seed, environments are reset with explicit seeds, and
+gradient steps may be split over calls in any way. So a run that goes on from a checkpoint,
+wherever it was written, does what the uninterrupted run does.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from numpy.typing import NDArray
+
+from race import checkpoints, programs, run_directory
+from race.algorithms import Algorithm, algorithm_of
+from race.config import Config
+from race.envs import make_task
+from race.errors import CheckpointError, DivergenceError
+from race.evaluation import evaluate
+from race.interrupts import Interrupts
+from race.metrics import MetricsWriter
+from race.replay import Replay
+from race.rollouts.host import EnvPool, collect
+from race.run_directory import RunDirectory
+from race.run_state import (
+    Progress,
+    Purpose,
+    RunState,
+    fresh,
+    from_checkpoint,
+    host_seeds,
+    n_teams,
+    root_key,
+    to_arrays,
+)
+from race.types import Rollout, Task, Transition
+
+CHUNK = 100
+"""Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
+
+Report = Callable[[str, Progress, dict[str, Any]], None]
+"""Told what is going on: the stage, the progress, and the newest row of metrics."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What does not change during a run, and its resources."""
+
+    config: Config
+    task: Task
+    algorithm: Algorithm
+    directory: RunDirectory
+    pool: EnvPool  # one environment per acting team
+    test_pool: EnvPool
+    metrics: MetricsWriter
+    interrupts: Interrupts
+    report: Report
+    began: float  # time.perf_counter() when the process began
+
+    @property
+    def statics(self) -> dict[str, Any]:
+        """The static arguments of the compiled programs."""
+        return {"algorithm": self.algorithm, "spec": self.task.spec, "config": self.config}
+
+
+def silent(stage: str, progress: Progress, row: dict[str, Any]) -> None:
+    """A report to nobody."""
+
+
+def train(
+    path: Path, config: Config, *, report: Report = silent, began: float | None = None
+) -> Progress:
+    """Trains in ``path``: from the newest checkpoint if there is one, else from the start.
+
+    ``path`` is a run directory made by `race.run_directory.create`. Returns how far it came:
+    short of ``config.env_steps`` if it was interrupted, after saving a checkpoint.
+
+    Raises:
+        RaceError: each with a message for the user; see the subclasses in `race.errors`.
+    """
+    began = time.perf_counter() if began is None else began
+    directory, algorithm = RunDirectory(path), algorithm_of(config)
+    report("preparing the task", Progress(), {})
+    task = make_task(config.task, config.env)
+    with run_directory.lock(path):
+        newest = checkpoints.newest(directory.checkpoints)
+        if newest is None:
+            state = fresh(config, task.spec, algorithm)
+        else:
+            state = from_checkpoint(checkpoints.load(newest), config, task.spec, algorithm)
+        run_directory.clear_finished(path)
+        n_tests = config.evaluation.episodes * (2 if config.has_population else 1)
+        processes = config.env.processes
+        with (
+            EnvPool(task, n_teams(config), processes) as pool,
+            EnvPool(task, n_tests, processes) as test_pool,
+            MetricsWriter(directory.metrics, state.progress.metrics_offset) as metrics,
+            Interrupts() as interrupts,
+        ):
+            run = Run(
+                config=config,
+                task=task,
+                algorithm=algorithm,
+                directory=directory,
+                pool=pool,
+                test_pool=test_pool,
+                metrics=metrics,
+                interrupts=interrupts,
+                report=report,
+                began=began,
+            )
+            try:
+                progress = _train(run, state).progress
+            except DivergenceError as error:
+                raise DivergenceError(f"{error} {_last_good(directory)}") from error
+        if progress.env_steps >= config.env_steps and not progress.learning:
+            run_directory.mark_finished(path)
+    return progress
+
+
+def _last_good(directory: RunDirectory) -> str:
+    newest = checkpoints.newest(directory.checkpoints)
+    if newest is None:
+        return "There is no checkpoint yet."
+    return f"The last good checkpoint is {newest}; evaluate and render use it."
+
+
+def _train(run: Run, state: RunState) -> RunState:
+    clock = _Clock(run)
+    if state.progress.env_steps == 0:
+        state = warm_up(run, state)
+        state = _save(run, clock.stamp(state))
+    while state.progress.learning or state.progress.env_steps < run.config.env_steps:
+        state = generation(run, state, clock)
+        if run.interrupts.requested:
+            break
+    return _save(run, clock.stamp(state))
+
+
+def warm_up(run: Run, state: RunState) -> RunState:
+    """Random episodes before the first generation, exactly as many steps as asked for.
+
+    Raises:
+        DivergenceError: if the environment gives a reward that is not finite.
+    """
+    config, spec = run.config, run.task.spec
+    teams, collected, index = n_teams(config), 0, 0
+    replay = state.replay
+    while collected < config.learner.random_steps:
+        run.report("random steps", state.progress.but(env_steps=collected), {})
+        missing = config.learner.random_steps - collected
+        playing = min(teams, missing)
+        seeds = host_seeds(config, Purpose.WARM_UP, index, playing + 1)
+        generator = np.random.default_rng(int(seeds[-1]))
+        shape = (playing, spec.joint_action_size)
+
+        def choose(
+            _: NDArray[np.float32],
+            tick: int,
+            generator: np.random.Generator = generator,
+            shape: tuple[int, int] = shape,
+        ) -> NDArray[np.float32]:
+            return generator.uniform(-1, 1, shape).astype(np.float32)
+
+        rollout = collect(run.pool, choose, seeds[:-1], max_ticks=missing // playing)
+        _check_returns(rollout, "a random episode")
+        replay = store(replay, rollout.transitions)
+        collected += len(rollout.transitions.reward)
+        index += 1
+    progress = state.progress.but(env_steps=collected, random_steps=collected)
+    return state._replace(replay=replay, progress=progress)
+
+
+def generation(run: Run, state: RunState, clock: "_Clock") -> RunState:
+    """One pass of Algorithm 1, or the rest of one that a checkpoint broke off.
+
+    Comments name the lines of Algorithm 1. An interrupt leaves the gradient steps half done.
+    """
+    if not state.progress.learning:
+        clock.begin()
+        state, rollout = roll_out(run, state)  # 3-6
+        state = evolve(run, state, rollout)  # 9
+        state = clock.rolled_out(state)
+    while _owed(run, state) > 0:
+        state = learn(run, state)  # 8, 10, 13
+        if clock.checkpoint_due():
+            state = _save(run, clock.stamp(state))
+        if run.interrupts.requested:
+            return state
+    algorithm = run.algorithm.inject(state.algorithm)  # 11
+    state = state._replace(algorithm=algorithm, progress=state.progress.but(learning=False))
+    state = clock.stamp(state)
+    _write_generation(run, state)
+    state = state._replace(losses=programs.empty_losses(run.algorithm))
+    every, progress = run.config.evaluation.every, state.progress
+    if (
+        progress.env_steps // every > progress.evaluated_at // every
+        or progress.env_steps >= run.config.env_steps
+    ):
+        state = test(run, state)
+        state = clock.stamp(state)
+    return state
+
+
+def roll_out(run: Run, state: RunState) -> tuple[RunState, Rollout]:
+    """Lines 3 to 6: every team plays one episode; all steps go to the replay buffer.
+
+    Raises:
+        DivergenceError: if a fitness or an action is not a finite number.
+    """
+    config, progress = run.config, state.progress
+    run.report("rollouts", progress, {})
+    teams = run.algorithm.teams(state.algorithm)
+    seeds = host_seeds(config, Purpose.ROLLOUT, progress.generation, n_teams(config))
+    key = _key(run, Purpose.ROLLOUT, progress.generation)
+
+    def choose(states: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
+        action = programs.act(
+            teams,
+            states,
+            key,
+            np.int32(tick),
+            spec=run.task.spec,
+            base=config.base,
+            noise=config.learner.exploration_noise,
+        )
+        return np.asarray(action)
+
+    rollout = collect(run.pool, choose, seeds)
+    _check_returns(rollout, f"generation {progress.generation + 1}")
+    returns = rollout.episode_return.tolist()
+    progress = progress.but(
+        env_steps_before=progress.env_steps,
+        env_steps=progress.env_steps + len(rollout.transitions.reward),
+        gradient_steps_before=progress.gradient_steps,
+        generation=progress.generation + 1,
+        fitness=tuple(returns[:-1]),
+        marl_return=returns[-1],
+        learning=True,
+    )
+    replay = store(state.replay, rollout.transitions)
+    return state._replace(replay=replay, progress=progress), rollout
+
+
+def store(replay: Replay, transitions: Transition) -> Replay:
+    """Appends transitions of any number, in pieces of one size."""
+    size = min(programs.INSERT_ROWS, replay.capacity)
+    for first in range(0, len(transitions.reward), size):
+        piece = Transition(*(column[first : first + size] for column in transitions))
+        count = len(piece.reward)
+        padded = Transition(
+            *(np.pad(c, [(0, size - count), *[(0, 0)] * (c.ndim - 1)]) for c in piece)
+        )
+        replay = programs.store(replay, padded, np.int32(count))
+    return replay
+
+
+def evolve(run: Run, state: RunState, rollout: Rollout) -> RunState:
+    """Line 9: the population evolves by the fitness just measured."""
+    if not run.config.has_population:
+        return state
+    fitness = jnp.asarray(rollout.episode_return[:-1], jnp.float32)
+    key = _key(run, Purpose.EVOLUTION, state.progress.generation)
+    algorithm = programs.evolve(state.algorithm, fitness, key, **run.statics)
+    return state._replace(algorithm=algorithm)
+
+
+def learn(run: Run, state: RunState) -> RunState:
+    """Lines 8, 10 and 13: some of the gradient steps that the generation owes.
+
+    Raises:
+        DivergenceError: if a loss is not a finite number.
+    """
+    progress = state.progress
+    count = min(CHUNK, _owed(run, state))
+    algorithm, losses = programs.learn(
+        state.algorithm,
+        state.losses,
+        state.replay,
+        root_key(run.config, Purpose.LEARNING),
+        np.int32(progress.gradient_steps),
+        np.int32(count),
+        **run.statics,
+    )
+    for name, value in losses.items():
+        if not math.isfinite(float(value)):
+            raise DivergenceError(
+                f"The {name} loss is no longer a finite number, between gradient steps "
+                f"{progress.gradient_steps} and {progress.gradient_steps + count} of generation "
+                f"{progress.generation}. Start a new run with smaller learning rates "
+                "(--learner.actor-learning-rate, --learner.critic-learning-rate)."
+            )
+    if progress.gradient_steps == 0:
+        run.report(
+            "learning", progress, {"time/first_gradient_steps": time.perf_counter() - run.began}
+        )
+    progress = progress.but(gradient_steps=progress.gradient_steps + count)
+    run.report("learning", progress, {})
+    return state._replace(algorithm=algorithm, losses=losses, progress=progress)
+
+
+def _owed(run: Run, state: RunState) -> int:
+    progress = state.progress
+    learned_from = progress.env_steps - progress.random_steps
+    due = math.floor(learned_from * run.config.learner.gradient_steps_per_env_step)
+    return due - progress.gradient_steps
+
+
+def test(run: Run, state: RunState) -> RunState:
+    """Plays the test episodes and writes their row."""
+    config, progress = run.config, state.progress
+    run.report("evaluation", progress, {})
+    encoder, heads = run.algorithm.teams(state.algorithm)
+    played = {"marl": heads[-1]}
+    if config.has_population:
+        played["champion"] = run.algorithm.champion(state.algorithm)
+    seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, config.evaluation.episodes)
+    scores = evaluate(run.test_pool, encoder, played, seeds, run.task.spec, config.base)
+    scores["selected"] = scores[progress.selected]
+    row: dict[str, Any] = {"kind": "evaluation", **_counters(progress)}
+    for name, score in scores.items():
+        row[f"eval/{name}/return_mean"] = score.mean
+        row[f"eval/{name}/return_std"] = score.std
+        row[f"eval/{name}/length_mean"] = float(score.lengths.mean())
+    progress = progress.but(evaluated_at=progress.env_steps)
+    run.metrics.write(row)
+    run.report("evaluation", progress, row)
+    return state._replace(progress=progress)
+
+
+def _write_generation(run: Run, state: RunState) -> None:
+    progress = state.progress
+    steps = progress.gradient_steps - progress.gradient_steps_before
+    delay = run.config.learner.policy_delay
+    policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
+    row: dict[str, Any] = {"kind": "generation", **_counters(progress)}
+    row["marl/return"] = progress.marl_return
+    if progress.fitness:
+        row["population/fitness_max"] = max(progress.fitness)
+        row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
+        row["population/fitness_min"] = min(progress.fitness)
+        fates = np.asarray(run.algorithm.injection_counts(state.algorithm)).tolist()
+        for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
+            row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
+    for name, total in state.losses.items():
+        count = policy_steps if name in run.algorithm.policy_losses else steps
+        row[f"loss/{name}"] = float(total) / count if count else None
+    env_steps = progress.env_steps - progress.env_steps_before
+    seconds = max(progress.generation_seconds, 1e-9)
+    row["time/env_steps_per_second"] = env_steps / seconds
+    row["time/rollout_fraction"] = progress.rollout_seconds / seconds
+    run.metrics.write(row)
+    run.report("generation", progress, row)
+
+
+def _counters(progress: Progress) -> dict[str, Any]:
+    names = ("generation", "env_steps", "gradient_steps", "wall_seconds")
+    return {name: getattr(progress, name) for name in names}
+
+
+def _check_returns(rollout: Rollout, where: str) -> None:
+    for team, value in enumerate(rollout.episode_return.tolist()):
+        if not math.isfinite(value):
+            raise DivergenceError(
+                f"The return of team {team} in {where} is {value}: the environment gave a reward "
+                "that is not a finite number. A fitness like that never wins, and a buffer that "
+                "holds it teaches nothing, so the run stops here. Look at the task's reward."
+            )
+
+
+def _key(run: Run, purpose: Purpose, index: int) -> PRNGKeyArray:
+    return jax.random.fold_in(root_key(run.config, purpose), index)
+
+
+def _save(run: Run, state: RunState) -> RunState:
+    run.metrics.sync()
+    progress = state.progress.but(metrics_offset=run.metrics.offset)
+    state = state._replace(progress=progress)
+    arrays, info, rows = to_arrays(state)
+    name = f"step-{progress.env_steps:012d}"
+    run.report("saving", progress, {})
+    checkpoints.save(
+        run.directory.checkpoints, name, arrays, info, rows, run.config.checkpoint.keep
+    )
+    return state
+
+
+class _Clock:
+    """Wall time of the run, of the generation and since the last checkpoint."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._last = time.perf_counter()
+        self._saved = self._last
+        self._generation = self._last
+
+    def begin(self) -> None:
+        """A generation begins."""
+        self._generation = time.perf_counter()
+
+    def rolled_out(self, state: RunState) -> RunState:
+        """Its rollouts are over."""
+        jax.block_until_ready(state.replay)
+        seconds = time.perf_counter() - self._generation
+        progress = state.progress.but(rollout_seconds=seconds, generation_seconds=seconds)
+        return self.stamp(state._replace(progress=progress), add=False)
+
+    def stamp(self, state: RunState, add: bool = True) -> RunState:
+        """Brings the times in the state up to now."""
+        now = time.perf_counter()
+        passed, self._last = now - self._last, now
+        progress = state.progress
+        return state._replace(
+            progress=dataclasses.replace(
+                progress,
+                wall_seconds=progress.wall_seconds + passed,
+                generation_seconds=progress.generation_seconds + passed * add,
+            )
+        )
+
+    def checkpoint_due(self) -> bool:
+        """Whether enough time has passed since the last checkpoint; if so, it starts again."""
+        now = time.perf_counter()
+        due = now - self._saved >= 60 * self._run.config.checkpoint.minutes
+        if due:
+            self._saved = now
+        return due
+
+
+__all__ = ["CheckpointError", "Report", "Run", "train"]
