@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple, final
 
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import NDArray
 
 from race.errors import RenderError, TaskError
@@ -117,9 +118,8 @@ class TargetEnv(gymnasium.Env[State, State]):
         self._state = np.zeros(4, np.float32)
 
     @staticmethod
-    def optimal_action(state: State) -> State:
-        """The best joint action in a state: within (-0.9, 0.9); shapes [..., 4] -> [..., 3]."""
-        x = np.asarray(state)
+    def optimal_action(x: Float[np.ndarray, "*b 4"]) -> Float[np.ndarray, "*b 3"]:
+        """The best joint action in a state; within (-0.9, 0.9)."""
         targets = (
             0.8 * np.tanh(x[..., 0] + x[..., 1]),
             0.8 * np.sin(2 * x[..., 0]),
@@ -155,11 +155,12 @@ class ChainEnv(gymnasium.Env[State, State]):
         self._state = np.zeros(2, np.float32)
 
     @staticmethod
-    def optimal_q(state: State, action: State, discount: float) -> NDArray[np.float64]:
-        """Discounted return of an action followed by the best ones; [..., 2], [..., 2] -> [...]."""
-        x, mean = np.asarray(state, np.float64), np.mean(action, axis=-1, dtype=np.float64)
-        end = 1 + x[..., 1] - np.mean(np.square(action), axis=-1, dtype=np.float64)
-        return np.where(x[..., 0] < 0.5, discount * (1 + mean), end)
+    def optimal_q(
+        state: Float[np.ndarray, "*b 2"], action: Float[np.ndarray, "*b 2"], discount: float
+    ) -> Float[np.ndarray, "*b"]:
+        """Discounted return of an action followed by the best ones."""
+        end = 1 + state[..., 1] - np.mean(np.square(action), axis=-1)
+        return np.where(state[..., 0] < 0.5, discount * (1 + np.mean(action, axis=-1)), end)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -226,14 +227,14 @@ class CoordinationEnv(gymnasium.Env[State, State]):
         self.action_space = _box(2)
 
     @staticmethod
-    def reward(action: State) -> NDArray[np.float64]:
-        """The reward of joint actions, in (0, 1]; shapes [..., 2] -> [...]."""
+    def reward(action: Float[np.ndarray, "*b 2"]) -> Float[np.ndarray, "*b"]:
+        """The reward of joint actions, in (0, 1]."""
 
-        def hill(top: tuple[float, float], width: float) -> NDArray[np.float64]:
+        def hill(top: tuple[float, float], width: float) -> Any:
             square = np.sum(np.square(np.asarray(action, np.float64) - top[0]), axis=-1)
             return top[1] * np.exp(-square / (2 * width**2))
 
-        return np.maximum(hill(COORDINATION_LOCAL, 0.5), hill(COORDINATION_BEST, 0.3))
+        return np.asarray(np.maximum(hill(COORDINATION_LOCAL, 0.5), hill(COORDINATION_BEST, 0.3)))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
