@@ -188,13 +188,18 @@ def _reference(
             "global_categories": tuple(config.global_categories),
         }
     try:
-        return mamujoco_v1.parallel_env(scenario, partition, gym_env=env, **options)
+        reference = mamujoco_v1.parallel_env(scenario, partition, gym_env=env, **options)
     except Exception as error:
         raise ConfigError(
             f"gymnasium-robotics cannot build these observations of {scenario} ({error}): "
             f"{options or 'its own defaults'}. Leave out categories that this robot does not have; "
             "every robot has qpos and qvel."
         ) from error
+    # The library sorts joints by name, and two joints of Pusher have the same one: their order
+    # would differ from process to process.
+    for joints in (joints for near in reference.k_dicts for joints in near.values()):
+        joints.sort(key=lambda node: (node.label, node.act_ids))
+    return reference
 
 
 def _check_categories(config: EnvConfig) -> None:
