@@ -92,7 +92,7 @@ class EnvConfig:
 class EvaluationConfig:
     """Test episodes during training, without exploration noise."""
 
-    every: int = 10_000
+    every: int = 5_000
     """Environment steps between evaluations (at the next end of a generation)."""
     episodes: int = 10
     """Episodes per team and evaluation."""

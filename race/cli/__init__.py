@@ -1,0 +1,79 @@
+"""The command line: ``race COMMAND ...``. Each command is a module of this package."""
+
+import difflib
+import importlib
+import sys
+import time
+
+from race import __version__
+from race.errors import RaceError
+
+_BEGAN = time.perf_counter()
+
+COMMANDS = {
+    "train": "train a team",
+    "resume": "go on with a run exactly where it was",
+    "evaluate": "play test episodes with a trained team and report its returns",
+    "render": "make a video of a trained team",
+    "plot": "draw learning curves of one or more runs",
+    "list": "show tasks, algorithms and presets",
+    "bench": "measure speed and memory on this machine",
+    "doctor": "show what is installed, what is missing and how to mend it",
+}
+
+_EXAMPLE = """\
+For example:
+  race train mamujoco/HalfCheetah-2x3 --seed 1 --env-steps 100000 --run-dir runs/first
+  race evaluate runs/first
+  race render runs/first --out team.mp4
+  race plot runs/first --out curves.png
+
+`race COMMAND --help` explains a command and all its options."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs a command. Exits with 0, 1 (failed, with a message), 2 (bad usage) or 130 (Ctrl-C)."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_overview())
+        return
+    if arguments[0] in ("-V", "--version"):
+        print(f"race {__version__}")
+        return
+    command, *rest = arguments
+    if command not in COMMANDS:
+        near = difflib.get_close_matches(command, COMMANDS, n=1)
+        hint = f" Did you mean `race {near[0]}`?" if near else ""
+        print(f"race: there is no command {command!r}.{hint}\n\n{_overview()}", file=sys.stderr)
+        sys.exit(2)
+    try:
+        importlib.import_module(f"race.cli.{command}").main(rest)
+    except RaceError as error:
+        print(f"race {command}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print(f"\nrace {command}: interrupted.", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output, such as `head`, has gone.
+        sys.stderr.close()
+        sys.exit(141)
+
+
+def seconds_since_start() -> float:
+    """Seconds since the command line was entered."""
+    return time.perf_counter() - _BEGAN
+
+
+def _overview() -> str:
+    lines = "\n".join(f"  {name:<10}{what}" for name, what in COMMANDS.items())
+    return (
+        "usage: race COMMAND ...\n\n"
+        "RACE trains teams of cooperating agents: multi-agent reinforcement learning\n"
+        "coupled with an evolving population of teams.\n\n"
+        f"{lines}\n\n{_EXAMPLE}"
+    )
+
+
+if __name__ == "__main__":
+    main()

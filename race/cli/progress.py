@@ -1,0 +1,108 @@
+"""What a person sees of a training run: a progress bar, or lines where there is no terminal."""
+
+import time
+from types import TracebackType
+from typing import Any, Self, final
+
+from rich.console import Console
+from rich.progress import BarColumn, SpinnerColumn, TaskID, TextColumn
+from rich.progress import Progress as Bar
+
+from race.config import Config
+from race.run_state import Progress
+
+
+@final
+class TrainingDisplay:
+    """Shows the progress of one run; pass `report` to `race.trainer.train`."""
+
+    def __init__(self, config: Config, console: Console) -> None:
+        self._config = config
+        self._console = console
+        self._bar = Bar(
+            SpinnerColumn(),
+            TextColumn("{task.fields[stage]:<14}"),
+            BarColumn(bar_width=24),
+            TextColumn("{task.percentage:>3.0f}%"),
+            TextColumn("{task.fields[details]}"),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task: TaskID = self._bar.add_task(
+            "", total=config.env_steps, stage="starting", details=""
+        )
+        self._origin: tuple[float, float] | None = None
+        self._test = ""
+        self._rate = 0.0
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def report(self, stage: str, progress: Progress, row: dict[str, Any]) -> None:
+        """A `race.trainer.Report`."""
+        if progress.gradient_steps == 0 and stage == "learning" and not row:
+            stage = "compiling"
+        covered = _covered(progress)
+        self._bar.update(
+            self._task, completed=covered, stage=stage, details=self._details(progress, covered)
+        )
+        if "eval/selected/return_mean" in row:
+            self._test = _test_summary(row)
+            self._console.print(self._line(row), highlight=False, soft_wrap=True)
+
+    def _details(self, progress: Progress, covered: float) -> str:
+        now = time.monotonic()
+        if progress.learning and self._origin is None:
+            self._origin = (now, covered)
+        parts = [f"generation {progress.generation}"]
+        if self._origin is not None and now - self._origin[0] > 1:
+            self._rate = (covered - self._origin[1]) / (now - self._origin[0])
+        if self._rate > 0:
+            left = max(self._config.env_steps - covered, 0) / self._rate
+            parts += [f"{self._rate:.0f} steps/s", f"{_duration(left)} left"]
+        if progress.fitness:
+            parts.append(f"population best {max(progress.fitness):.0f}")
+        if progress.generation:
+            parts.append(f"MARL team {progress.marl_return:.0f}")
+        return " · ".join(parts)
+
+    def _line(self, row: dict[str, Any]) -> str:
+        return (
+            f"{row['env_steps']:>9,} steps, generation {row['generation']:>4}, "
+            f"{_duration(row['wall_seconds']):>7}: test return {_test_summary(row)}"
+        )
+
+
+def _covered(progress: Progress) -> float:
+    """Environment steps, those of the current generation counted as their gradient steps go."""
+    if not progress.learning:
+        return progress.env_steps
+    collected = progress.env_steps - progress.env_steps_before
+    learned = progress.gradient_steps - progress.gradient_steps_before
+    return min(progress.env_steps_before + learned, progress.env_steps_before + collected)
+
+
+def _test_summary(row: dict[str, Any]) -> str:
+    names = [name for name in ("marl", "champion") if f"eval/{name}/return_mean" in row]
+    labels = {"marl": "MARL team", "champion": "champion"}
+    return ", ".join(
+        f"{labels[name]} {row[f'eval/{name}/return_mean']:.1f} "
+        f"± {row[f'eval/{name}/return_std']:.1f}"
+        for name in names
+    )
+
+
+def _duration(seconds: float) -> str:
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}h{m:02}m" if hours else f"{m}m{s:02}s"
