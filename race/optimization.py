@@ -25,7 +25,9 @@ def init_trainable(params: Any) -> Trainable:
 
 def descend(trained: Trainable, gradient: Any, learning_rate: float, clip: float) -> Trainable:
     """One Adam step along a gradient whose global norm is first clipped to ``clip``."""
-    updates, optimizer = _adam(learning_rate, clip).update(gradient, trained.optimizer)
+    # Optax raises a float to an integer power, which strict promotion, where set, would refuse.
+    with jax.numpy_dtype_promotion("standard"):
+        updates, optimizer = _adam(learning_rate, clip).update(gradient, trained.optimizer)
     return Trainable(optax.apply_updates(trained.params, updates), optimizer)
 
 

@@ -1,0 +1,92 @@
+"""Settings of the test session, and the tiny task that most tests share.
+
+`race` is imported inside the fixtures: this file is read before the type checks of
+``--jaxtyping-packages`` are in place.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from functools import cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+@pytest.fixture(scope="session")
+def tiny_spec() -> Any:
+    """Two agents of unequal sizes whose observations overlap and whose actions interleave."""
+    from race.types import EnvSpec
+
+    return EnvSpec(
+        task="tiny",
+        state_size=4,
+        obs_index=((2, 0, 3), (1, 3)),
+        action_index=((1,), (2, 0)),
+        action_low=(-1.0,) * 3,
+        action_high=(1.0,) * 3,
+        episode_limit=5,
+    )
+
+
+@pytest.fixture(scope="session")
+def tiny_config() -> Callable[..., Any]:
+    """(algo, base, learner settings, race settings) -> a resolved Config of tiny networks."""
+    from race.config import Config, LearnerConfig, RaceConfig, resolve
+
+    def make(
+        algo: str = "race",
+        base: str = "matd3",
+        learner: dict[str, Any] | None = None,
+        race: dict[str, Any] | None = None,
+    ) -> Any:
+        learner_config = LearnerConfig(hidden_sizes=(5, 4), batch_size=3)
+        race_config = RaceConfig(
+            policy_embedding_size=3, mine_size=6, vmm_weight=0.3, mutation_fraction=0.5
+        )
+        return resolve(
+            Config(
+                task="tiny",
+                algo=algo if algo == "race" else base,  # type: ignore[arg-type]
+                base=base,  # type: ignore[arg-type]
+                learner=dataclasses.replace(learner_config, **(learner or {})),
+                race=dataclasses.replace(race_config, **(race or {})),
+            )
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def batch_of() -> Callable[..., Any]:
+    """(spec, size, seed) -> a random minibatch; about a third of its samples terminated."""
+    from race.types import Transition
+
+    def make(spec: Any, size: int = 3, seed: int = 0) -> Any:
+        rng = np.random.default_rng(seed)
+        columns = (
+            rng.normal(size=(size, spec.state_size)),
+            rng.uniform(-1, 1, size=(size, spec.joint_action_size)),
+            rng.normal(size=size),
+            (np.arange(size) % 3 == 1).astype(float),
+            rng.normal(size=(size, spec.state_size)),
+        )
+        return Transition(*(jnp.asarray(column, jnp.float32) for column in columns))
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def compiled() -> Callable[..., Callable[..., Any]]:
+    """(algorithm, name, spec, config) -> that function of the algorithm, compiled once."""
+
+    @cache
+    def make(algorithm: Any, name: str, spec: Any, config: Any) -> Callable[..., Any]:
+        return jax.jit(partial(getattr(algorithm, name), spec=spec, config=config))
+
+    return make
