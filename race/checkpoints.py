@@ -225,16 +225,21 @@ def save(
     return target
 
 
-def load(path: Path) -> Checkpoint:
-    """Reads a checkpoint after checking every byte of it.
+def load(path: Path, *, tables: bool = True) -> Checkpoint:
+    """Reads a checkpoint after checking every byte of what it reads.
+
+    Args:
+        path: the checkpoint's folder.
+        tables: whether to read the long tables too; a trained team does not need them.
 
     Raises:
         CheckpointError: if the checkpoint is missing, damaged, foreign, or of another version;
             names the next older intact one if there is any.
     """
     try:
-        body = _verify(path)
-        return Checkpoint(path, load_file(path / _ARRAYS), body["info"], _read_rows(path, body))
+        body = _verify(path, tables)
+        rows = _read_rows(path, body) if tables else {}
+        return Checkpoint(path, load_file(path / _ARRAYS), body["info"], rows)
     except (_DamagedError, OSError, SafetensorError) as error:
         raise CheckpointError(
             f"The checkpoint {path} cannot be used: {error}. {_advice(path)}"
@@ -365,9 +370,11 @@ def _read_rows(path: Path, body: dict[str, Any]) -> dict[str, Rows]:
     return tables
 
 
-def _verify(path: Path) -> dict[str, Any]:
+def _verify(path: Path, tables: bool = True) -> dict[str, Any]:
     body = _read_manifest(path)
     for file, entry in body["files"].items():
+        if not tables and file != _ARRAYS:
+            continue
         if not (path / file).is_file():
             raise _DamagedError(f"its file {file} is missing")
         if not _has_size(path / file, entry["bytes"]):

@@ -321,9 +321,10 @@ def _build(cls: Any, data: Any) -> Any:
     hints = get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}
     if not isinstance(data, dict) or set(data) != names:
+        found = sorted(data) if isinstance(data, dict) else data
         raise ConfigError(
             f"The saved configuration does not fit this version of race: {cls.__name__} has the "
-            f"fields {sorted(names)}, the file has {sorted(data) if isinstance(data, dict) else data}."
+            f"fields {sorted(names)}, the file has {found}."
         )
     values = {}
     for name, value in data.items():

@@ -105,6 +105,21 @@ def create(
     return run
 
 
+def change_config(path: Path, config: Config) -> None:
+    """Replaces the configuration of the run in ``path``, as when a run is extended.
+
+    Raises:
+        RunDirectoryError: if it cannot be written.
+    """
+    file = RunDirectory(path).config
+    try:
+        _write(file, _json(configs.to_json(config)))
+    except OSError as error:
+        raise RunDirectoryError(
+            f"{file} cannot be written: {error}. See that it is writable and the disk is not full."
+        ) from error
+
+
 def open_run(path: Path) -> Config:
     """The configuration of the run in ``path``.
 

@@ -120,7 +120,8 @@ def fresh(config: Config, spec: EnvSpec, algorithm: Algorithm) -> RunState:
 def to_arrays(state: RunState) -> tuple[dict[str, Any], dict[str, Any], dict[str, Rows]]:
     """What `race.checkpoints.save` takes: arrays, info, rows."""
     replay = state.replay
-    rows = Rows(replay.data._asdict(), int(replay.inserted), replay.capacity)
+    columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
+    rows = Rows(columns, int(replay.inserted), replay.capacity)
     arrays = flatten({"algorithm": state.algorithm, "losses": state.losses})
     return arrays, {"progress": dataclasses.asdict(state.progress)}, {"replay": rows}
 
@@ -133,31 +134,48 @@ def from_checkpoint(
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.
     """
-    progress = _progress(saved)
-    template = fresh(config, spec, algorithm)
-    tree = {"algorithm": template.algorithm, "losses": template.losses}
+    progress = progress_of(saved)
+    trained = learned_of(saved, config, spec, algorithm)
+    replay = _replay(saved, init_replay(spec, replay_rows(config, spec)))
+    return RunState(trained["algorithm"], trained["losses"], replay, progress)
+
+
+def learned_of(
+    saved: Checkpoint, config: Config, spec: EnvSpec, algorithm: Algorithm
+) -> dict[str, Any]:
+    """The algorithm's state and the loss sums that a checkpoint holds.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+    key = root_key(config, Purpose.INIT)
+    template = {
+        "algorithm": start(key, algorithm=algorithm, spec=spec, config=config),
+        "losses": empty_losses(algorithm),
+    }
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
-    restored = copy(restore(tree, saved.arrays))
-    return RunState(
-        restored["algorithm"],
-        restored["losses"],
-        _replay(saved, template.replay),
-        progress,
-    )
+    return copy(restore(template, saved.arrays))
 
 
-def _progress(saved: Checkpoint) -> Progress:
+def progress_of(saved: Checkpoint) -> Progress:
+    """The progress that a checkpoint holds.
+
+    Raises:
+        CheckpointError: if it holds none that this version understands.
+    """
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
-    if not isinstance(values, dict) or set(values) != names or "replay" not in saved.rows:
+    if not isinstance(values, dict) or set(values) != names:
         raise CheckpointError(
-            f"The checkpoint {saved.path} was not written by this version of race: it lacks "
-            "the run's progress or its replay buffer. Use the version named in metadata.json."
+            f"The checkpoint {saved.path} was not written by this version of race: its record of "
+            "the run's progress differs. Use the version named in metadata.json."
         )
     return Progress(**{**values, "fitness": tuple(values["fitness"])})
 
 
 def _replay(saved: Checkpoint, empty: Replay) -> Replay:
+    if "replay" not in saved.rows:
+        raise CheckpointError(f"The checkpoint {saved.path} holds no replay buffer.")
     rows = saved.rows["replay"]
     if rows.inserted > rows.capacity != empty.capacity:
         raise CheckpointError(

@@ -71,9 +71,9 @@ class TrainingDisplay:
             left = max(self._config.env_steps - covered, 0) / self._rate
             parts += [f"{self._rate:.0f} steps/s", f"{_duration(left)} left"]
         if progress.fitness:
-            parts.append(f"population best {max(progress.fitness):.0f}")
+            parts.append(f"population best {rounded(max(progress.fitness))}")
         if progress.generation:
-            parts.append(f"MARL team {progress.marl_return:.0f}")
+            parts.append(f"MARL team {rounded(progress.marl_return)}")
         return " · ".join(parts)
 
     def _line(self, row: dict[str, Any]) -> str:
@@ -96,8 +96,8 @@ def _test_summary(row: dict[str, Any]) -> str:
     names = [name for name in ("marl", "champion") if f"eval/{name}/return_mean" in row]
     labels = {"marl": "MARL team", "champion": "champion"}
     return ", ".join(
-        f"{labels[name]} {row[f'eval/{name}/return_mean']:.1f} "
-        f"± {row[f'eval/{name}/return_std']:.1f}"
+        f"{labels[name]} {rounded(row[f'eval/{name}/return_mean'])} "
+        f"± {rounded(row[f'eval/{name}/return_std'])}"
         for name in names
     )
 
@@ -106,3 +106,8 @@ def _duration(seconds: float) -> str:
     minutes, s = divmod(round(seconds), 60)
     hours, m = divmod(minutes, 60)
     return f"{hours}h{m:02}m" if hours else f"{m}m{s:02}s"
+
+
+def rounded(value: float) -> str:
+    """A return for people to read: one decimal, more where it is small."""
+    return f"{value:,.1f}" if abs(value) >= 100 else f"{value:.3g}"

@@ -1,0 +1,99 @@
+"""``race evaluate``."""
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from race.errors import ConfigError
+
+BATCH = 20
+"""Episodes played at the same time."""
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Play test episodes with a trained team, without exploration, and report its returns.
+
+    The same seed plays the same episodes. Progress goes to standard error.
+    """
+
+    run_dir: Annotated[Path, tyro.conf.Positional]
+    """The run's directory."""
+    team: Literal["marl", "champion", "selected"] = "selected"
+    """The gradient learner's team, the population's team of best training fitness, or of these
+    two the one with the better training return."""
+    episodes: int = 10
+    """Episodes to play."""
+    seed: int = 0
+    """Seed of the episodes."""
+    json: bool = False
+    """Print one JSON object instead of text."""
+
+
+def main(arguments: list[str]) -> None:
+    """Parses the arguments, plays and prints."""
+    chosen = tyro.cli(Evaluate, args=arguments, prog="race evaluate")
+    if chosen.episodes < 1:
+        raise ConfigError(f"--episodes is {chosen.episodes}, but it must be at least 1.")
+    if chosen.seed < 0:
+        raise ConfigError(f"--seed is {chosen.seed}, but it must be 0 or more.")
+    import numpy as np
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from race.cli.compilation import use_cache
+    from race.cli.progress import rounded
+    from race.evaluation import Score, evaluate
+    from race.rollouts.host import EnvPool
+    from race.trained import load_trained
+
+    use_cache()
+    trained = load_trained(chosen.run_dir)
+    name = trained.resolve(chosen.team)
+    seeds = np.random.SeedSequence(chosen.seed).generate_state(chosen.episodes).astype(np.int64)
+    batches = [seeds[i : i + BATCH] for i in range(0, len(seeds), BATCH)]
+    spec, base = trained.task.spec, trained.config.base
+    parts: list[Score] = []
+    with (
+        EnvPool(trained.task, len(batches[0]), trained.config.env.processes) as pool,
+        Progress(console=Console(stderr=True), transient=True) as bar,
+    ):
+        playing = bar.add_task("playing", total=len(seeds))
+        for batch in batches:
+            heads = {name: trained.heads[name]}
+            parts.append(evaluate(pool, trained.encoder, heads, batch, spec, base)[name])
+            bar.advance(playing, len(batch))
+    score = Score(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    result = {
+        "task": trained.config.task,
+        "method": trained.config.method,
+        "env_steps": trained.progress.env_steps,
+        "team": chosen.team,
+        "played": name,
+        "seed": chosen.seed,
+        "episodes": chosen.episodes,
+        "return_mean": score.mean,
+        "return_std": score.std,
+        "return_min": float(score.returns.min()),
+        "return_max": float(score.returns.max()),
+        "length_mean": float(score.lengths.mean()),
+        "returns": score.returns.tolist(),
+    }
+    if chosen.json:
+        json.dump(result, sys.stdout, indent=2)
+        print()
+        return
+    label = {"marl": "the MARL team", "champion": "the champion of the population"}[name]
+    which = f"selected: {label}" if chosen.team == "selected" else label
+    print(
+        f"{result['method']} on {result['task']}, {result['env_steps']:,} environment steps, "
+        f"{which}\n"
+        f"return over {chosen.episodes} episodes: {rounded(score.mean)} ± "
+        f"{rounded(score.std)} (from {rounded(score.returns.min())} to "
+        f"{rounded(score.returns.max())}), "
+        f"episode length {result['length_mean']:.0f}"
+    )

@@ -1,0 +1,72 @@
+"""``race list``."""
+
+import dataclasses
+import json
+from dataclasses import dataclass
+from typing import get_args
+
+import tyro
+
+from race.config import PRESETS, TABLE_3, Algo
+
+ALGORITHMS = {
+    "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "
+    "maddpg)",
+    "matd3": "MATD3: twin central critics, delayed policies, target smoothing",
+    "maddpg": "MADDPG: one central critic",
+}
+
+
+@dataclass(frozen=True)
+class List:
+    """Show tasks, algorithms and presets."""
+
+    json: bool = False
+    """Print one JSON object instead of tables."""
+
+
+def main(arguments: list[str]) -> None:
+    """Parses the arguments and prints."""
+    chosen = tyro.cli(List, args=arguments, prog="race list")
+    from race.envs import describe_tasks
+
+    tasks = describe_tasks()
+    assert set(ALGORITHMS) == set(get_args(Algo))
+    if chosen.json:
+        listing = {
+            "tasks": [
+                {
+                    **info._asdict(),
+                    "alpha": TABLE_3.get(info.id, (None, None))[0],
+                    "beta": TABLE_3.get(info.id, (None, None))[1],
+                }
+                for info in tasks
+            ],
+            "algorithms": ALGORITHMS,
+            "presets": {name: dataclasses.asdict(preset) for name, preset in PRESETS.items()},
+        }
+        print(json.dumps(listing, indent=2))
+        return
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table("task", "in the paper", "alpha", "beta", "what it is", title="Tasks")
+    table.columns[0].no_wrap = True
+    for info in tasks:
+        alpha, beta = TABLE_3.get(info.id, ("", ""))
+        table.add_row(info.id, info.paper_name or "", str(alpha), str(beta), info.description)
+    console.print(table)
+    console.print("Also your own: package.module:function, see docs/environments.md\n")
+    algorithms = Table("--algo", "what it is", title="Algorithms")
+    for name, what in ALGORITHMS.items():
+        algorithms.add_row(name, what)
+    console.print(algorithms)
+    presets = Table("--preset", "settings", title="Presets of the learner")
+    for name, preset in PRESETS.items():
+        presets.add_row(
+            name,
+            f"batch {preset.batch_size}, Adam {preset.actor_learning_rate:g}, "
+            f"{preset.random_steps:,} random steps",
+        )
+    console.print(presets)
