@@ -5,6 +5,7 @@
 """
 
 import dataclasses
+import os
 from collections.abc import Callable
 from functools import cache, partial
 from typing import Any
@@ -14,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+# Tests compile many small programs and run each a few times: compiling fast beats running fast.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
