@@ -39,7 +39,11 @@ def tiny_spec() -> Any:
 
 @pytest.fixture(scope="session")
 def tiny_config() -> Callable[..., Any]:
-    """(algo, base, learner settings, race settings) -> a resolved Config of tiny networks."""
+    """(algo, base, learner settings, race settings) -> a resolved Config of tiny networks.
+
+    Targets are not smoothed and gradients not clipped, so that losses can be worked out; all
+    teams enter the tournament, so that fates can be scripted.
+    """
     from race.config import Config, LearnerConfig, RaceConfig, resolve
 
     def make(
@@ -48,9 +52,15 @@ def tiny_config() -> Callable[..., Any]:
         learner: dict[str, Any] | None = None,
         race: dict[str, Any] | None = None,
     ) -> Any:
-        learner_config = LearnerConfig(hidden_sizes=(5, 4), batch_size=3)
+        learner_config = LearnerConfig(
+            hidden_sizes=(5, 4), batch_size=3, smoothing_noise=0.0, gradient_clip=1e6
+        )
         race_config = RaceConfig(
-            policy_embedding_size=3, mine_size=6, vmm_weight=0.3, mutation_fraction=0.5
+            policy_embedding_size=3,
+            mine_size=6,
+            vmm_weight=0.3,
+            mutation_fraction=0.5,
+            tournament_size=10,
         )
         return resolve(
             Config(

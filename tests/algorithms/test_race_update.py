@@ -16,7 +16,9 @@ import numpy as np
 import optax
 import pytest
 
-from race.algorithms import race
+from race.algorithms import marl, race
+from race.algorithms.marl import MarlState
+from race.algorithms.marl import Targets as MarlTargets
 from race.config import Config
 from race.types import EnvSpec
 
@@ -262,10 +264,8 @@ def stepped(
     batch_of: Callable[..., Any],
     compiled: Callable[..., Any],
 ) -> Step:
-    config = tiny_config(
-        "race", request.param, learner={"smoothing_noise": 0.0, "gradient_clip": 1e6}
-    )
-    before = separate(compiled(race, "init", tiny_spec, config)(jax.random.key(11)))
+    config = tiny_config("race", request.param)
+    before = separate(race.init(jax.random.key(11), tiny_spec, config))
     batch = batch_of(tiny_spec, B)
     after, critic_losses, policy_losses = compiled(race, "update", tiny_spec, config)(
         before, batch, jnp.int32(1), jax.random.key(5)
@@ -428,6 +428,60 @@ def test_teams_are_drawn_uniformly(
     assert (np.abs(counts - 300 / n) < 5 * np.sqrt(300 / n)).all()
 
 
+# --- the learner alone ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def stepped_alone(
+    stepped: Step,
+    tiny_config: Callable[..., Config],
+    batch_of: Callable[..., Any],
+    compiled: Callable[..., Any],
+) -> Any:
+    """One step of the learner without a population, from the same networks and minibatch."""
+    spec, b = stepped.frozen.spec, stepped.before
+    config = tiny_config("marl", stepped.config.base)
+    state = MarlState(
+        b.policies.encoder,
+        b.policies.head,
+        b.critics.critic,
+        MarlTargets(b.target.encoder, b.target.head, b.target.critic),
+    )
+    update = compiled(marl, "update", spec, config)
+    return update(state, batch_of(spec, B), jnp.int32(1), jax.random.key(0))
+
+
+def assert_trees_close(one: Any, two: Any) -> None:
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7)
+
+
+def test_the_critic_and_the_marl_heads_learn_as_without_a_population(
+    stepped: Step, stepped_alone: Any
+) -> None:
+    alone, critic_losses, policy_losses = stepped_alone
+    after = stepped.after
+    assert_trees_close(alone.critic, after.critics.critic)
+    assert_trees_close(alone.head, after.policies.head)
+    assert_trees_close(alone.target.critic, after.target.critic)
+    assert_trees_close(alone.target.head, after.target.head)
+    np.testing.assert_allclose(critic_losses["critic"], stepped.critic_losses["critic"], rtol=1e-5)
+    np.testing.assert_allclose(policy_losses["policy"], stepped.policy_losses["policy"], rtol=1e-5)
+
+
+def test_without_a_population_encoders_learn_from_the_marl_critic_alone(
+    stepped: Step, stepped_alone: Any
+) -> None:
+    f = stepped.frozen
+    policies, critics = params(stepped.before.policies), params(stepped.after.critics)
+    assert_gradients_equal(
+        gradient_of(stepped_alone[0].encoder),
+        numeric_gradient(
+            lambda e: marl_loss(e, policies.head, critics.critic, f), policies.encoder
+        ),
+    )
+
+
 # --- target policy smoothing ------------------------------------------------------------------
 
 
@@ -442,7 +496,7 @@ def test_targets_of_both_critics_are_smoothed(
     The losses seen must be those of one of the 8 noises per sample, whatever key drew it.
     """
     config = tiny_config(learner={"smoothing_noise": 1e6, "smoothing_clip": 0.5})
-    before = separate(compiled(race, "init", tiny_spec, config)(jax.random.key(11)))
+    before = separate(race.init(jax.random.key(11), tiny_spec, config))
     batch = batch_of(tiny_spec, 2)
     _, losses, _ = compiled(race, "update", tiny_spec, config)(
         before, batch, jnp.int32(0), jax.random.key(2)
