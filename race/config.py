@@ -103,7 +103,7 @@ class CheckpointConfig:
     """When the whole state is written to disk."""
 
     minutes: float = 5.0
-    """Wall time between checkpoints; 0 writes one after each generation."""
+    """Wall time between checkpoints; 0 writes one at every opportunity (100 gradient steps)."""
     keep: int = 2
     """Newest checkpoints kept."""
 

@@ -106,11 +106,28 @@ def replay_rows(config: Config, spec: EnvSpec) -> int:
     return min(config.learner.replay_capacity, max(longest, INSERT_ROWS))
 
 
+def statics(config: Config, spec: EnvSpec, algorithm: Algorithm) -> dict[str, Any]:
+    """The static arguments of the compiled programs.
+
+    What no program reads is set to one value, so that runs that differ in it alone share programs.
+    """
+    unread = Config(config.task)
+    shared = dataclasses.replace(
+        config,
+        seed=unread.seed,
+        env_steps=unread.env_steps,
+        env=unread.env,
+        evaluation=unread.evaluation,
+        checkpoint=unread.checkpoint,
+    )
+    return {"algorithm": algorithm, "spec": spec, "config": shared}
+
+
 def fresh(config: Config, spec: EnvSpec, algorithm: Algorithm) -> RunState:
     """The state before the first step."""
     key = root_key(config, Purpose.INIT)
     return RunState(
-        algorithm=copy(start(key, algorithm=algorithm, spec=spec, config=config)),
+        algorithm=copy(start(key, **statics(config, spec, algorithm))),
         losses=empty_losses(algorithm),
         replay=init_replay(spec, replay_rows(config, spec)),
         progress=Progress(),
@@ -150,7 +167,7 @@ def learned_of(
     """
     key = root_key(config, Purpose.INIT)
     template = {
-        "algorithm": start(key, algorithm=algorithm, spec=spec, config=config),
+        "algorithm": start(key, **statics(config, spec, algorithm)),
         "losses": empty_losses(algorithm),
     }
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.

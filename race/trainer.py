@@ -24,7 +24,7 @@ from race import checkpoints, programs, run_directory
 from race.algorithms import Algorithm, algorithm_of
 from race.config import Config
 from race.envs import make_task
-from race.errors import CheckpointError, DivergenceError
+from race.errors import DivergenceError
 from race.evaluation import evaluate
 from race.interrupts import Interrupts
 from race.metrics import MetricsWriter
@@ -40,6 +40,7 @@ from race.run_state import (
     host_seeds,
     n_teams,
     root_key,
+    statics,
     to_arrays,
 )
 from race.types import Rollout, Task, Transition
@@ -69,7 +70,7 @@ class Run:
     @property
     def statics(self) -> dict[str, Any]:
         """The static arguments of the compiled programs."""
-        return {"algorithm": self.algorithm, "spec": self.task.spec, "config": self.config}
+        return statics(self.config, self.task.spec, self.algorithm)
 
 
 def silent(stage: str, progress: Progress, row: dict[str, Any]) -> None:
@@ -143,6 +144,8 @@ def _train(run: Run, state: RunState) -> RunState:
         state = generation(run, state, clock)
         if run.interrupts.requested:
             break
+        if clock.checkpoint_due():
+            state = _save(run, clock.stamp(state))
     return _save(run, clock.stamp(state))
 
 
@@ -436,4 +439,4 @@ class _Clock:
         return due
 
 
-__all__ = ["CheckpointError", "Report", "Run", "train"]
+__all__ = ["Report", "Run", "train"]

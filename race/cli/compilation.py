@@ -14,7 +14,7 @@ def cache_directory() -> Path:
 
 def use_cache() -> None:
     """Turns the cache on, unless JAX was given one already or the folder cannot be written."""
-    if jax.config.read("jax_compilation_cache_dir") is not None:
+    if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
     directory = cache_directory()
     try:

@@ -2,7 +2,7 @@
 
 import time
 from types import TracebackType
-from typing import Any, Self, final
+from typing import Any, final
 
 from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TaskID, TextColumn
@@ -36,7 +36,7 @@ class TrainingDisplay:
         self._test = ""
         self._rate = 0.0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "TrainingDisplay":
         self._bar.start()
         return self
 
