@@ -124,9 +124,7 @@ def test_crossover_exchanges_whole_heads_of_the_same_agent(agents: int) -> None:
         assert_frequency(both, 0.25, len(KEYS))
 
 
-@pytest.mark.parametrize(
-    ("size", "agents"), [(3, 1), (3, 2), (3, 6), (5, 1), (5, 2), (5, 6), (8, 2), (8, 6)]
-)
+@pytest.mark.parametrize(("size", "agents"), [(3, 1), (3, 2), (5, 2), (5, 6), (8, 6)])
 def test_breeding_replaces_exactly_those_that_do_not_reproduce(size: int, agents: int) -> None:
     heads = signed_heads(size, agents)
     elite, parent = size - 1, 0
@@ -162,7 +160,7 @@ def head_with_padding(agents: int = 1) -> jax.Array:
     return 1.0 + jax.random.uniform(jax.random.key(5), (agents, H + 1, 3))
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.05, 0.25, 0.7, 1.0])
+@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.7, 1.0])
 def test_mutation_changes_exactly_the_fraction_of_each_row(fraction: float) -> None:
     head = head_with_padding()[0]
     mutate = jax.jit(
@@ -204,30 +202,27 @@ def test_shares_and_strengths_of_mutation() -> None:
         assert_frequency((change[kind] > 0).sum(), 0.5, int(kind.sum()))
 
 
-@pytest.mark.parametrize(
-    ("agents", "probability"), [(1, 0.5), (2, 0.5), (6, 0.5), (2, 0.0), (2, 1.0)]
-)
+@pytest.mark.parametrize(("agents", "probability"), [(1, 0.5), (6, 0.5), (2, 0.0), (2, 1.0)])
 def test_mutation_picks_agents_and_at_least_one(agents: int, probability: float) -> None:
-    team, mask = head_with_padding(agents), jnp.stack([MASK] * agents)
+    team = jnp.concatenate([head_with_padding()] * agents)
+    mask = jnp.stack([MASK] * agents)
     mutate = jax.jit(jax.vmap(partial(genetics.mutate, team, mask, 0.25, probability)))
-    picked = (np.asarray(mutate(KEYS)) != np.asarray(team)).any(axis=(2, 3))
+    mutated = np.asarray(mutate(KEYS))
+    picked = (mutated != np.asarray(team)).any(axis=(2, 3))
     assert picked.any(axis=1).all()
     p = probability + (1 - probability) ** agents / agents
     for agent in range(agents):
         assert_frequency(picked[:, agent].sum(), p, len(KEYS))
+    # The agents were equal: each has drawn its own changes.
+    both = picked[:, 0] & picked[:, -1]
+    assert agents == 1 or (mutated[both, 0] != mutated[both, -1]).any(axis=(1, 2)).all()
     if probability == 0:
         assert (picked.sum(axis=1) == 1).all()
     else:
         assert_frequency(picked.all(axis=1).sum(), probability**agents if agents > 1 else 1, 2000)
 
 
-def test_agents_of_a_team_mutate_differently() -> None:
-    team = jnp.ones((2, H + 1, 3))
-    mutated = genetics.mutate(team, jnp.ones((2, 3), bool), 1.0, 1.0, KEYS[0])
-    assert (mutated[0, :-1] != mutated[1, :-1]).all()
-
-
-@pytest.mark.parametrize(("size", "probability"), [(3, 0.9), (5, 0.0), (5, 1.0), (8, 0.9)])
+@pytest.mark.parametrize(("size", "probability"), [(3, 1.0), (8, 0.9)])
 def test_each_team_but_the_elite_mutates_with_the_probability(
     size: int, probability: float
 ) -> None:
@@ -237,7 +232,8 @@ def test_each_team_but_the_elite_mutates_with_the_probability(
     mutate = jax.jit(
         jax.vmap(partial(genetics.mutate_population, heads, elite, mask, 0.25, probability, 0.5))
     )
-    changed = np.asarray(mutate(KEYS[:1000])) != np.asarray(heads)
+    mutated = np.asarray(mutate(KEYS[:1000]))
+    changed = mutated != np.asarray(heads)
     teams = changed.any(axis=(2, 3, 4))
     assert not teams[:, 1].any()
     for team in (t for t in range(size) if t != 1):
@@ -245,14 +241,9 @@ def test_each_team_but_the_elite_mutates_with_the_probability(
     padded = ~np.broadcast_to(np.asarray(mask)[:, None], (2, H + 1, 3))
     assert not changed[..., padded].any()
     assert not changed[:, :, :, -1].any()
-
-
-def test_teams_mutate_differently() -> None:
-    heads = jnp.ones((3, 1, H + 1, 3))
-    mutated = genetics.mutate_population(
-        heads, jnp.int32(0), jnp.ones((1, 3), bool), 1.0, 1.0, 1.0, KEYS[0]
-    )
-    assert (mutated[1, :, :-1] != mutated[2, :, :-1]).all()
+    # The teams were equal: each has drawn its own changes.
+    both = teams[:, 0] & teams[:, 2]
+    assert (mutated[both, 0] != mutated[both, 2]).any(axis=(1, 2, 3)).all()
 
 
 # --- injection -----------------------------------------------------------------------------
