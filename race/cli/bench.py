@@ -47,10 +47,12 @@ def main(arguments: list[str]) -> None:
         json.dump([result.to_json() for result in results], sys.stdout, indent=2)
         print()
         return
-    table = Table("measurement", "value", "unit", "goal", "")
-    table.columns[1].justify = table.columns[3].justify = "right"
+    table = Table("measurement", "value", "goal", "", box=None)
+    for column in table.columns:
+        column.no_wrap = True
     for result in results:
         goal = "" if result.goal is None else f"<= {result.goal:g}"
         verdict = {None: "", True: "met", False: "not met"}[result.met]
-        table.add_row(result.name, f"{result.value:,.3g}", result.unit, goal, verdict)
+        value = f"{result.value:,.0f}" if result.value >= 1000 else f"{result.value:.3g}"
+        table.add_row(result.name, f"{value} {result.unit}", goal, verdict)
     Console().print(table)

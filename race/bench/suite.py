@@ -1,0 +1,43 @@
+"""All measurements and the choice among them."""
+
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+
+from race.bench import environments, memory, startup, training, update
+from race.bench.measurement import Measurement, Subject
+from race.errors import ConfigError
+
+
+def subjects() -> list[Subject]:
+    """Everything that can be measured, in the order of the table."""
+    modules = (update, training, startup, memory, environments)
+    return [subject for module in modules for subject in module.subjects()]
+
+
+def matches(name: str, pattern: str | None) -> bool:
+    """Whether a measurement is asked for: by a part of its name, or a pattern with * and ?."""
+    return pattern is None or pattern in name or fnmatchcase(name, pattern)
+
+
+def chosen(every: list[Subject], pattern: str | None) -> list[Subject]:
+    """The subjects with at least one measurement that is asked for.
+
+    Raises:
+        ConfigError: if no measurement fits the pattern; the message lists all.
+    """
+    found = [s for s in every if any(matches(name, pattern) for name in s.names)]
+    if not found:
+        names = "\n  ".join(name for subject in every for name in subject.names)
+        raise ConfigError(f"Nothing to measure is called {pattern!r}. There is:\n  {names}")
+    return found
+
+
+def measure(
+    subjects: list[Subject], pattern: str | None, begins: Callable[[Subject], None]
+) -> list[Measurement]:
+    """Takes the measurements asked for; ``begins`` is told of each subject first."""
+    results: list[Measurement] = []
+    for subject in subjects:
+        begins(subject)
+        results += [m for m in subject.measure() if matches(m.name, pattern)]
+    return results
