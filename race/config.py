@@ -12,7 +12,7 @@ from race.errors import ConfigError
 
 Algo = Literal["race", "matd3", "maddpg"]
 Base = Literal["matd3", "maddpg"]
-Preset = Literal["paper", "td3"]
+Preset = Literal["paper", "td3", "demo"]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,8 @@ TABLE_3: dict[str, tuple[float, float]] = {
     "mamujoco/HumanoidStandup-9x8": (1.0, 1e-3),
 }
 
-# Presets of the gradient learner. "td3": the values of the official TD3 code.
+# Presets of the gradient learner. "td3": the values of the official TD3 code. "demo": smaller
+# networks and fewer random steps, to see a team learn within minutes; not for comparisons.
 PRESETS: dict[str, LearnerConfig] = {
     "paper": LearnerConfig(),
     "td3": LearnerConfig(
@@ -155,6 +156,7 @@ PRESETS: dict[str, LearnerConfig] = {
         critic_learning_rate=3e-4,
         random_steps=25_000,
     ),
+    "demo": LearnerConfig(hidden_sizes=(160, 120), random_steps=3_000),
 }
 
 

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses
-from race.checkpoints import Checkpoint, Rows, flatten, restore
+from race.checkpoints import Checkpoint, Rows
 from race.config import Config
 from race.errors import CheckpointError
 from race.optimization import copy
 from race.programs import INSERT_ROWS, empty_losses, start
 from race.replay import Replay, init_replay
+from race.trees import flatten, restore
 from race.types import EnvSpec, Transition
 
 

@@ -6,7 +6,6 @@ gradient steps may be split over calls in any way. So a run that goes on from a 
 wherever it was written, does what the uninterrupted run does.
 """
 
-import dataclasses
 import math
 import time
 from collections.abc import Callable
@@ -22,12 +21,14 @@ from numpy.typing import NDArray
 
 from race import checkpoints, programs, run_directory
 from race.algorithms import Algorithm, algorithm_of
+from race.clock import Clock
 from race.config import Config
 from race.envs import make_task
 from race.errors import DivergenceError
 from race.evaluation import evaluate
 from race.interrupts import Interrupts
 from race.metrics import MetricsWriter
+from race.records import evaluation_row, generation_row
 from race.replay import Replay
 from race.rollouts.host import EnvPool, collect
 from race.run_directory import RunDirectory
@@ -136,7 +137,7 @@ def _last_good(directory: RunDirectory) -> str:
 
 
 def _train(run: Run, state: RunState) -> RunState:
-    clock = _Clock(run)
+    clock = Clock(run.config.checkpoint.minutes)
     if state.progress.env_steps == 0:
         state = warm_up(run, state)
         state = _save(run, clock.stamp(state))
@@ -183,7 +184,7 @@ def warm_up(run: Run, state: RunState) -> RunState:
     return state._replace(replay=replay, progress=progress)
 
 
-def generation(run: Run, state: RunState, clock: "_Clock") -> RunState:
+def generation(run: Run, state: RunState, clock: Clock) -> RunState:
     """One pass of Algorithm 1, or the rest of one that a checkpoint broke off.
 
     Comments name the lines of Algorithm 1. An interrupt leaves the gradient steps half done.
@@ -202,7 +203,9 @@ def generation(run: Run, state: RunState, clock: "_Clock") -> RunState:
     algorithm = run.algorithm.inject(state.algorithm)  # 11
     state = state._replace(algorithm=algorithm, progress=state.progress.but(learning=False))
     state = clock.stamp(state)
-    _write_generation(run, state)
+    row = generation_row(run.config, run.algorithm, state)
+    run.metrics.write(row)
+    run.report("generation", state.progress, row)
     state = state._replace(losses=programs.empty_losses(run.algorithm))
     every, progress = run.config.evaluation.every, state.progress
     if (
@@ -328,46 +331,11 @@ def test(run: Run, state: RunState) -> RunState:
         played["champion"] = run.algorithm.champion(state.algorithm)
     seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, config.evaluation.episodes)
     scores = evaluate(run.test_pool, encoder, played, seeds, run.task.spec, config.base)
-    scores["selected"] = scores[progress.selected]
-    row: dict[str, Any] = {"kind": "evaluation", **_counters(progress)}
-    for name, score in scores.items():
-        row[f"eval/{name}/return_mean"] = score.mean
-        row[f"eval/{name}/return_std"] = score.std
-        row[f"eval/{name}/length_mean"] = float(score.lengths.mean())
+    row = evaluation_row(progress, scores)
     progress = progress.but(evaluated_at=progress.env_steps)
     run.metrics.write(row)
     run.report("evaluation", progress, row)
     return state._replace(progress=progress)
-
-
-def _write_generation(run: Run, state: RunState) -> None:
-    progress = state.progress
-    steps = progress.gradient_steps - progress.gradient_steps_before
-    delay = run.config.learner.policy_delay
-    policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
-    row: dict[str, Any] = {"kind": "generation", **_counters(progress)}
-    row["marl/return"] = progress.marl_return
-    if progress.fitness:
-        row["population/fitness_max"] = max(progress.fitness)
-        row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
-        row["population/fitness_min"] = min(progress.fitness)
-        fates = np.asarray(run.algorithm.injection_counts(state.algorithm)).tolist()
-        for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
-            row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
-    for name, total in state.losses.items():
-        count = policy_steps if name in run.algorithm.policy_losses else steps
-        row[f"loss/{name}"] = float(total) / count if count else None
-    env_steps = progress.env_steps - progress.env_steps_before
-    seconds = max(progress.generation_seconds, 1e-9)
-    row["time/env_steps_per_second"] = env_steps / seconds
-    row["time/rollout_fraction"] = progress.rollout_seconds / seconds
-    run.metrics.write(row)
-    run.report("generation", progress, row)
-
-
-def _counters(progress: Progress) -> dict[str, Any]:
-    names = ("generation", "env_steps", "gradient_steps", "wall_seconds")
-    return {name: getattr(progress, name) for name in names}
 
 
 def _check_returns(rollout: Rollout, where: str) -> None:
@@ -395,48 +363,6 @@ def _save(run: Run, state: RunState) -> RunState:
         run.directory.checkpoints, name, arrays, info, rows, run.config.checkpoint.keep
     )
     return state
-
-
-class _Clock:
-    """Wall time of the run, of the generation and since the last checkpoint."""
-
-    def __init__(self, run: Run) -> None:
-        self._run = run
-        self._last = time.perf_counter()
-        self._saved = self._last
-        self._generation = self._last
-
-    def begin(self) -> None:
-        """A generation begins."""
-        self._generation = time.perf_counter()
-
-    def rolled_out(self, state: RunState) -> RunState:
-        """Its rollouts are over."""
-        jax.block_until_ready(state.replay)
-        seconds = time.perf_counter() - self._generation
-        progress = state.progress.but(rollout_seconds=seconds, generation_seconds=seconds)
-        return self.stamp(state._replace(progress=progress), add=False)
-
-    def stamp(self, state: RunState, add: bool = True) -> RunState:
-        """Brings the times in the state up to now."""
-        now = time.perf_counter()
-        passed, self._last = now - self._last, now
-        progress = state.progress
-        return state._replace(
-            progress=dataclasses.replace(
-                progress,
-                wall_seconds=progress.wall_seconds + passed,
-                generation_seconds=progress.generation_seconds + passed * add,
-            )
-        )
-
-    def checkpoint_due(self) -> bool:
-        """Whether enough time has passed since the last checkpoint; if so, it starts again."""
-        now = time.perf_counter()
-        due = now - self._saved >= 60 * self._run.config.checkpoint.minutes
-        if due:
-            self._saved = now
-        return due
 
 
 __all__ = ["Report", "Run", "train"]

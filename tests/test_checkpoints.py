@@ -20,8 +20,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from race.checkpoints import Rows, flatten, list_checkpoints, load, newest, restore, save
+from race.checkpoints import Rows, list_checkpoints, load, newest, save
 from race.errors import CheckpointError
+from race.trees import flatten, restore
 
 SEGMENT = 4
 

@@ -66,7 +66,7 @@ def main(arguments: list[str]) -> None:
     for name, preset in PRESETS.items():
         presets.add_row(
             name,
-            f"batch {preset.batch_size}, Adam {preset.actor_learning_rate:g}, "
-            f"{preset.random_steps:,} random steps",
+            f"layers {preset.hidden_sizes}, batch {preset.batch_size}, "
+            f"Adam {preset.actor_learning_rate:g}, {preset.random_steps:,} random steps",
         )
     console.print(presets)

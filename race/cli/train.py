@@ -45,7 +45,8 @@ class Train:
     run_dir: Path | None = None
     """Where the run is kept. Default: runs/TASK-ALGO-seedN."""
     preset: Preset = "paper"
-    """Learner settings to start from: the paper's, or those of the official TD3 code."""
+    """Learner settings to start from: the paper's, those of the official TD3 code, or small
+    networks for a quick look."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     race: RaceConfig = field(default_factory=RaceConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
