@@ -64,9 +64,11 @@ def q_values(
         shift: what inputs that are the same for the whole batch add to the first layer.
     """
     x = jnp.concatenate([state, action], axis=1)
-    x = jnp.einsum("bi,kih->kbh", x, critic.first.weight)
-    bias = critic.first.bias if shift is None else critic.first.bias + shift
-    x = jax.nn.leaky_relu(x + bias[:, None])
+    # One copy per critic: without them the product comes out transposed, which costs far more.
+    x = critic.first(jnp.broadcast_to(x, (critic.first.bias.shape[0], *x.shape)))
+    if shift is not None:
+        x = x + shift[:, None]
+    x = jax.nn.leaky_relu(x)
     x = jax.nn.leaky_relu(critic.hidden(x))
     return critic.out(x)[:, :, 0]
 

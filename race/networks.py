@@ -125,11 +125,14 @@ def init_policy_embedding(key: PRNGKeyArray, vector_size: int, size: int) -> Pol
 
 
 def embed_policy(embedding: PolicyEmbedding, vectors: Float[Array, "U H1"]) -> Float[Array, "E"]:
-    """Encodes each action entry's vector, then averages over action entries (Appendix A.1)."""
-    x = vectors
-    for layer in embedding.layers:
-        x = jax.nn.leaky_relu(layer(x))
-    return jnp.mean(x, axis=0)
+    """Encodes each action entry's vector, then averages over action entries (Appendix A.1).
+
+    As in Table 2, nothing follows the third layer.
+    """
+    first, second, out = embedding.layers
+    x = jax.nn.leaky_relu(first(vectors))
+    x = jax.nn.leaky_relu(second(x))
+    return jnp.mean(out(x), axis=0)
 
 
 class Mine(eqx.Module):
@@ -163,9 +166,9 @@ def mine_scores(
     The paper gives the two encoders and leaves open how they meet; here it is the inner product,
     which scores all B^2 pairs with one matrix product.
     """
-    x = jax.nn.leaky_relu(
-        jnp.einsum("bs,nsm->nbm", state, mine.state_hidden.weight) + mine.state_hidden.bias[:, None]
-    )
+    # One copy per agent, as in the critics.
+    x = jnp.broadcast_to(state, (z.shape[0], *state.shape))
+    x = jax.nn.leaky_relu(mine.state_hidden(x))
     x = jax.nn.leaky_relu(mine.state_out(x))
     y = mine.embedding(z)
     return jnp.einsum("ntm,nkm->ntk", x, y)
