@@ -28,7 +28,7 @@ class LearnerConfig:
     critic_learning_rate: float = 1e-3
     """Adam step size of the critic, the PeVFA, the state-value net and MINE."""
     gradient_clip: float = 10.0
-    """Largest global norm of each network's gradient."""
+    """Largest norm of a gradient: of all agents' encoders together, of all heads, of a critic."""
     discount: float = 0.99
     """Discount factor, the paper's gamma."""
     target_update_rate: float = 0.005
@@ -251,11 +251,11 @@ def _check(config: Config) -> None:
             "in (0, 100]",
         ),
         (
-            race.population_size >= 3,
+            race.population_size >= 4,
             "race.population-size",
             race.population_size,
-            "at least 3: crossover needs an elite, a second parent and a team to replace "
-            "(for no population use --algo matd3)",
+            "at least 4: an elite, a second parent, a team for their offspring and one for the "
+            "injected MARL team (for no population use --algo matd3)",
         ),
         (
             0 <= race.mutation_fraction <= 1,

@@ -22,6 +22,11 @@ RESET_SHARE = 0.05
 STRONG_STRENGTH = 10.0
 WEAK_STRENGTH = 0.1
 
+# Strong perturbations multiply, so that without a bound some weights of a long line of teams grow
+# to thousands and more. Behind a tanh that means no more than 10 does, but the PeVFA, which reads
+# the weights, would diverge. The paper has no bound.
+LARGEST_WEIGHT = 10.0
+
 
 class Selection(NamedTuple):
     """Who reproduces: the roles of the teams of a generation."""
@@ -33,7 +38,7 @@ class Selection(NamedTuple):
 
 
 def rank(fitness: Float[Array, "P"], key: PRNGKeyArray) -> Int[Array, "P"]:
-    """Teams from the fittest to the least fit; ties are ordered at random, NaN comes last."""
+    """Teams from the fittest to the least fit; ties, and NaN with -inf, are ordered at random."""
     order = jax.random.permutation(key, fitness.shape[0])
     shuffled = fitness[order]
     keys = jnp.where(jnp.isnan(shuffled), jnp.inf, -shuffled)
@@ -91,20 +96,22 @@ def mutate_agent(
     """Perturbs one agent's head, the function P of Section 3.3.
 
     In each action's row of weights w, ``fraction`` (the paper's alpha) of the entries change,
-    rounded to a whole number: most by N(0, (0.1 w)^2), a share of 0.05 by N(0, (10 w)^2), and a
-    share of 0.05 is redrawn from N(0, 1). Biases and padding stay.
+    rounded to a whole number but at least one if alpha is positive: most by N(0, (0.1 w)^2), a
+    share of 0.05 by N(0, (10 w)^2), and a share of 0.05 is redrawn from N(0, 1). What changes is
+    kept within `LARGEST_WEIGHT`. Biases and padding stay.
     """
     n_weights = weights.shape[0] - 1
+    n_picked = max(1, round(fraction * n_weights)) if fraction > 0 else 0
     pick_key, kind_key, noise_key = jax.random.split(key, 3)
     w = weights[:-1]
     order = jnp.argsort(jax.random.uniform(pick_key, w.shape), axis=0)
-    picked = jnp.argsort(order, axis=0) < round(fraction * n_weights)
+    picked = jnp.argsort(order, axis=0) < n_picked
     kind = jax.random.uniform(kind_key, w.shape)
     noise = jax.random.normal(noise_key, w.shape)
     strength = jnp.where(kind < STRONG_SHARE, STRONG_STRENGTH, WEAK_STRENGTH)
     perturbed = w + noise * strength * jnp.abs(w)
     reset = (kind >= STRONG_SHARE) & (kind < STRONG_SHARE + RESET_SHARE)
-    mutated = jnp.where(reset, noise, perturbed)
+    mutated = jnp.clip(jnp.where(reset, noise, perturbed), -LARGEST_WEIGHT, LARGEST_WEIGHT)
     mutated = jnp.where(picked & mask[None], mutated, w)
     return jnp.concatenate([mutated, weights[-1:]], axis=0)
 

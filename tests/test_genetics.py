@@ -160,7 +160,7 @@ def head_with_padding(agents: int = 1) -> jax.Array:
     return 1.0 + jax.random.uniform(jax.random.key(5), (agents, H + 1, 3))
 
 
-@pytest.mark.parametrize("fraction", [0.0, 0.25, 0.7, 1.0])
+@pytest.mark.parametrize("fraction", [0.0, 0.01, 0.25, 0.7, 1.0])
 def test_mutation_changes_exactly_the_fraction_of_each_row(fraction: float) -> None:
     head = head_with_padding()[0]
     mutate = jax.jit(
@@ -168,17 +168,27 @@ def test_mutation_changes_exactly_the_fraction_of_each_row(fraction: float) -> N
     )
     mutated = np.asarray(mutate(KEYS[:400]))
     changed = mutated != np.asarray(head)
-    assert (changed[:, :-1, :2].sum(axis=1) == round(fraction * H)).all()
+    expected = {0.0: 0, 0.01: 1, 0.25: 2, 0.7: 6, 1.0: 8}[fraction]  # at least one if any
+    assert (changed[:, :-1, :2].sum(axis=1) == expected).all()
     assert not changed[:, -1].any()  # biases
     assert not changed[:, :, 2].any()  # padding
     # Every weight is as likely to be picked as any other, and rows are picked for themselves.
     for count in changed[:, :-1, :2].sum(axis=0).ravel():
-        assert_frequency(count, round(fraction * H) / H, 400)
+        assert_frequency(count, expected / H, 400)
     if fraction == 0.25:
         assert (changed[:, :, 0] != changed[:, :, 1]).any(axis=1).mean() > 0.9
 
 
-def test_shares_and_strengths_of_mutation() -> None:
+def test_mutated_weights_are_bounded_and_others_are_left_alone() -> None:
+    head = jnp.full((1, 301, 2), 50.0)
+    mutated = genetics.mutate_agent(head[0], jnp.ones(2, bool), 0.5, jax.random.key(0))[:-1]
+    changed = np.asarray(mutated != 50.0)
+    assert changed.sum() == 300
+    assert np.abs(np.asarray(mutated)[changed]).max() == genetics.LARGEST_WEIGHT
+
+
+def test_shares_and_strengths_of_mutation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(genetics, "LARGEST_WEIGHT", float("inf"))
     # Weights so large that a reset, a strong and a weak change are told apart by their size.
     w = jnp.where(jnp.arange(1001)[:, None] % 2 == 0, 1e4, -2e4) * jnp.ones((1001, 100))
     mutated = genetics.mutate_agent(w, jnp.ones(100, bool), 1.0, jax.random.key(3))[:-1]

@@ -137,10 +137,9 @@ def test_policy_embedding_averages_over_actions(tiny_spec: EnvSpec, head: Any) -
     vectors = head_vectors(head, tiny_spec)
     rows = []
     for vector in float64(vectors):
-        x = vector
-        for layer in float64(embedding).layers:
-            x = leaky(x @ layer.weight + layer.bias)
-        rows.append(x)
+        first, second, out = float64(embedding).layers
+        x = leaky(leaky(vector @ first.weight + first.bias) @ second.weight + second.bias)
+        rows.append(x @ out.weight + out.bias)
     e = embed_policy(embedding, vectors)
     np.testing.assert_allclose(e, np.mean(rows, axis=0), rtol=1e-5, atol=1e-6)
     # A mean: the order of actions and their multiplicity do not count, each action does.

@@ -61,10 +61,10 @@ def embedding(pevfa: Any, spec: EnvSpec, head: np.ndarray) -> np.ndarray:
     rows = []
     for agent, entries in enumerate(spec.action_index):
         for place in range(len(entries)):
-            x = head[agent, :, place]
-            for layer in pevfa.embedding.layers:
-                x = leaky(x @ layer.weight + layer.bias)
-            rows.append(x)
+            first, second, out = pevfa.embedding.layers
+            x = leaky(head[agent, :, place] @ first.weight + first.bias)
+            x = leaky(x @ second.weight + second.bias)
+            rows.append(x @ out.weight + out.bias)
     return np.mean(rows, axis=0)
 
 

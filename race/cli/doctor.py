@@ -1,0 +1,40 @@
+"""``race doctor``."""
+
+import sys
+from dataclasses import dataclass
+
+import tyro
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Show what is installed, which renderer and accelerator were found, and what mends the rest.
+
+    Exits with 1 if something that race needs is missing.
+    """
+
+
+def main(arguments: list[str]) -> None:
+    """Looks and prints."""
+    tyro.cli(Doctor, args=arguments, prog="race doctor")
+    from rich.console import Console
+    from rich.table import Table
+
+    from race.cli.compilation import cache_directory
+    from race.doctor import examine
+
+    console = Console()
+    table = Table("", "what", "found", box=None)
+    marks = {"ok": "[green]ok[/]", "warning": "[yellow]note[/]", "missing": "[red]missing[/]"}
+    findings = []
+    with Console(stderr=True).status("looking"):
+        for finding in examine(cache_directory()):
+            findings.append(finding)
+            table.add_row(marks[finding.status], finding.name, finding.detail)
+    console.print(table)
+    remedies = [f for f in findings if f.remedy and f.status != "ok"]
+    for finding in remedies:
+        console.print(f"To mend {finding.name}: [bold]{finding.remedy}[/]", soft_wrap=True)
+    if any(finding.status == "missing" for finding in findings):
+        sys.exit(1)
+    console.print("Everything that race needs is here.")

@@ -1,0 +1,140 @@
+"""What is installed, what is missing, and the command that mends it."""
+
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from race import __version__
+from race.rendering import PACKAGES, choose_renderer
+from race.run_directory import DISTRIBUTION
+
+Status = Literal["ok", "warning", "missing"]
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at."""
+
+    name: str
+    status: Status
+    detail: str
+    remedy: str = ""  # the command that mends it
+
+
+def examine(cache: Path) -> Iterator[Finding]:
+    """Looks at everything, one finding after the other. Raises nothing.
+
+    Args:
+        cache: folder of the compilation cache.
+    """
+    yield Finding("race", "ok", f"{__version__}, in {Path(__file__).parent}")
+    yield _python()
+    yield from _packages()
+    checks: list[tuple[str, Callable[[], Finding], str]] = [
+        ("accelerator", _accelerator, "pip install --force-reinstall jax"),
+        ("physics", _physics, "pip install --force-reinstall 'gymnasium[mujoco]'"),
+        ("renderer", _renderer, PACKAGES),
+        ("video", _video, "pip install --force-reinstall imageio-ffmpeg"),
+        ("machine", _machine, ""),
+        ("compilation cache", lambda: _cache(cache), f"mkdir -p {cache}"),
+        ("disk", _disk, ""),
+    ]
+    for name, check, remedy in checks:
+        try:
+            yield check()
+        except Exception as error:  # whatever is broken here is what was looked for
+            yield Finding(name, "missing", f"{type(error).__name__}: {error}", remedy)
+
+
+def _python() -> Finding:
+    version = platform.python_version()
+    good = (3, 11) <= sys.version_info < (3, 14)
+    return Finding(
+        "python",
+        "ok" if good else "warning",
+        version if good else f"{version}; race is made for 3.11 to 3.13",
+        "" if good else "make PYTHON=/path/to/python3.11 demo",
+    )
+
+
+def _packages() -> Iterator[Finding]:
+    try:
+        required = importlib.metadata.requires(DISTRIBUTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        yield Finding("packages", "missing", "race itself is not installed", "pip install .")
+        return
+    for requirement in required:
+        if "extra ==" in requirement:
+            continue
+        name = re.split(r"[\[<>=!~; ]", requirement, maxsplit=1)[0]
+        try:
+            yield Finding(name, "ok", importlib.metadata.version(name))
+        except importlib.metadata.PackageNotFoundError:
+            needed = requirement.split(";")[0].strip()
+            yield Finding(name, "missing", "not installed", f"pip install '{needed}'")
+
+
+def _accelerator() -> Finding:
+    import jax
+
+    devices = jax.devices()
+    kinds = ", ".join(f"{d.platform} {d.device_kind}" for d in devices)
+    if devices[0].platform == "cpu" and shutil.which("nvidia-smi"):
+        return Finding(
+            "accelerator",
+            "warning",
+            f"JAX uses {kinds}, though this machine has an NVIDIA driver",
+            "pip install 'race-marl[cuda]'",
+        )
+    return Finding("accelerator", "ok", f"JAX {jax.__version__} on {kinds}")
+
+
+def _physics() -> Finding:
+    from race.config import EnvConfig
+    from race.envs import make_task
+
+    task = make_task("mamujoco/Hopper-3x1", EnvConfig())
+    env = task.make(None)
+    env.reset(seed=0)
+    env.step(env.action_space.sample())
+    env.close()
+    return Finding("physics", "ok", "MuJoCo steps mamujoco/Hopper-3x1")
+
+
+def _renderer() -> Finding:
+    renderer = choose_renderer()
+    if renderer.backend == "sketch":
+        return Finding("renderer", "warning", renderer.reason, PACKAGES)
+    return Finding("renderer", "ok", renderer.reason)
+
+
+def _video() -> Finding:
+    import imageio_ffmpeg
+
+    return Finding("video", "ok", f"ffmpeg {imageio_ffmpeg.get_ffmpeg_version()}")
+
+
+def _machine() -> Finding:
+    cores = len(os.sched_getaffinity(0))
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    status: Status = "ok" if memory >= 2 else "warning"
+    return Finding("machine", status, f"{cores} cores, {memory:.0f} GiB of memory")
+
+
+def _cache(cache: Path) -> Finding:
+    cache.mkdir(parents=True, exist_ok=True)
+    probe = cache / f".probe-{os.getpid()}"
+    probe.touch()
+    probe.unlink()
+    return Finding("compilation cache", "ok", str(cache))
+
+
+def _disk() -> Finding:
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    detail = f"{free:.1f} GiB free in {Path.cwd()}"
+    return Finding("disk", "ok" if free >= 2 else "warning", detail)

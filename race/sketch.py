@@ -1,0 +1,468 @@
+"""Draws a MuJoCo model without OpenGL: rays against capsules, spheres, boxes and the ground.
+
+Slower machines and plain containers have no OpenGL to draw with. A robot of these tasks is a
+handful of simple solids, so numpy can cast the rays itself, with shading and a shadow, about as
+fast as OpenGL in software does.
+"""
+
+import colorsys
+from typing import Any, Literal, NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import UInt8
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+Size = tuple[int, int]
+View = Literal["side", "top", "corner"]
+
+_OVERSAMPLING = 2
+_HALF_ANGLE = np.deg2rad(20.0)  # of the image's shorter side
+_LIGHT = np.array([0.35, -0.5, 1.0]) / np.linalg.norm([0.35, -0.5, 1.0])  # towards the light
+_SKY_HIGH, _SKY_LOW = np.array([0.55, 0.70, 0.88]), np.array([0.93, 0.95, 0.97])
+_TILE_DARK, _TILE_LIGHT = np.array([0.66, 0.70, 0.72]), np.array([0.80, 0.83, 0.84])
+_BACKWARDS: dict[View, NDArray[np.float64]] = {  # from the target towards the eye
+    "side": np.array([0.0, -1.0, 0.17]),
+    "top": np.array([0.0, -0.25, 1.0]),
+    "corner": np.array([0.75, -1.0, 0.5]),
+}
+
+
+class _Camera(NamedTuple):
+    view: View
+    eye: NDArray[np.float64]  # [3]
+    right: NDArray[np.float64]  # [3], as up and forward: unit vectors of the image
+    up: NDArray[np.float64]
+    forward: NDArray[np.float64]
+    focal: float  # pixels
+    width: int  # pixels, oversampled
+    height: int
+    reach: float  # metres from the robot's centre to its farthest part, at rest
+
+
+class _Solid(NamedTuple):
+    kind: int  # mujoco.mjtGeom
+    centre: NDArray[np.float64]  # [3]
+    turn: NDArray[np.float64]  # [3, 3], from the solid's frame to the world's
+    size: NDArray[np.float64]  # [3]
+    bound: float  # radius of a ball around the centre that holds the solid
+    colour: NDArray[np.float64]  # [3]
+
+
+def draw(
+    model: mujoco.MjModel, data: mujoco.MjData, size: Size = (480, 360), caption: str = ""
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws the model as it stands in ``data``; the camera follows a robot that travels.
+
+    Robots that move in a vertical plane are seen from the side, those that move in a horizontal
+    plane from above, all others from a corner. The limbs of a robot differ in colour. Shapes
+    other than MuJoCo's basic solids are drawn as the box around them.
+
+    Args:
+        model: the compiled model.
+        data: its state, with positions up to date (as after a step or ``mj_forward``).
+        size: width and height of the image in pixels.
+        caption: a line of text in the upper left corner.
+    """
+    width, height = size
+    camera = _camera(model, data, width * _OVERSAMPLING, height * _OVERSAMPLING)
+    solids = _solids(model, data)
+    rays = _rays(camera, slice(0, camera.height), slice(0, camera.width))
+    ground = _ground_height(model, data)
+    image, depth = _background(camera, rays, ground)
+    for solid in solids:
+        _shadow(image, depth, camera, rays, solid, ground)
+    for solid in solids:
+        _paint(image, depth, camera, rays, solid)
+    image = image.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3).mean((1, 3))
+    pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    marks = _distance_marks(camera, ground) if camera.view == "side" else []
+    return _write(pixels, marks, caption)
+
+
+def with_caption(frame: UInt8[np.ndarray, "h w 3"], caption: str) -> UInt8[np.ndarray, "h w 3"]:
+    """A copy of the frame with a line of text in the upper left corner."""
+    return _write(frame, [], caption)
+
+
+# ---------------------------------------------------------------- camera
+
+
+def _camera(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> _Camera:
+    rest = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, rest)
+    mujoco.mj_comPos(model, rest)
+    moving = _moving_geoms(model)
+    places = rest.geom_xpos[moving]
+    bounds = model.geom_rbound[moving]
+    centre = (places.min(0) + places.max(0)) / 2 if len(places) else np.array(model.stat.center)
+    reach = float((np.linalg.norm(places - centre, axis=1) + bounds).max(initial=0.3))
+    travellers = _travellers(model)
+    target = centre.copy()
+    if travellers:
+        shift = (data.subtree_com[travellers] - rest.subtree_com[travellers]).mean(0)
+        # Half of the height only, so that a jump and a fall still show.
+        target += shift * np.array([1.0, 1.0, 0.5])
+    view = _view(model)
+    backward = _BACKWARDS[view] / np.linalg.norm(_BACKWARDS[view])
+    distance = 1.25 * reach / np.tan(_HALF_ANGLE)
+    right = np.array([1.0, 0.0, 0.0]) if view != "corner" else np.cross([0, 0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    focal = min(width, height) / 2 / np.tan(_HALF_ANGLE)
+    eye = target + distance * backward
+    return _Camera(
+        view, eye, right, np.cross(backward, right), -backward, focal, width, height, reach
+    )
+
+
+def _view(model: mujoco.MjModel) -> View:
+    hinges = model.jnt_axis[model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE]
+    loose = np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL)).any()
+    if len(hinges) and not loose:
+        axis = np.abs(hinges)
+        if (axis[:, 1] > 0.99).all():
+            return "side"
+        if (axis[:, 2] > 0.99).all():
+            return "top"
+    return "corner"
+
+
+def _travellers(model: mujoco.MjModel) -> list[int]:
+    """Bodies on the world that can go anywhere: the roots of robots, not the base of an arm."""
+    travelling = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE)
+    if not model.njnt or model.jnt_type[0] not in travelling:
+        return []
+    return sorted(
+        {
+            int(body)
+            for body, kind in zip(model.jnt_bodyid, model.jnt_type, strict=True)
+            if kind in travelling and model.body_parentid[body] == 0
+        }
+    )
+
+
+def _moving_geoms(model: mujoco.MjModel) -> NDArray[np.int64]:
+    moves = model.body_weldid[model.geom_bodyid] != 0
+    return np.flatnonzero(moves & _visible(model))
+
+
+def _visible(model: mujoco.MjModel) -> NDArray[np.bool_]:
+    return (model.geom_group < 3) & (model.geom_rgba[:, 3] > 0)
+
+
+def _rays(camera: _Camera, rows: slice, columns: slice) -> NDArray[np.float32]:
+    """Unit directions through the pixels' centres, [h, w, 3]."""
+    x = (np.arange(columns.start, columns.stop) + 0.5 - camera.width / 2) / camera.focal
+    y = (camera.height / 2 - np.arange(rows.start, rows.stop) - 0.5) / camera.focal
+    rays = (camera.forward + x[None, :, None] * camera.right + y[:, None, None] * camera.up).astype(
+        np.float32
+    )
+    return rays / np.sqrt(np.einsum("hwc,hwc->hw", rays, rays))[..., None]
+
+
+def _project(camera: _Camera, point: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Column, row (pixels, oversampled) and distance along the view (metres) of a point."""
+    offset = point - camera.eye
+    far = max(float(offset @ camera.forward), 1e-3)
+    return (
+        camera.width / 2 + camera.focal * float(offset @ camera.right) / far,
+        camera.height / 2 - camera.focal * float(offset @ camera.up) / far,
+        far,
+    )
+
+
+def _window(camera: _Camera, centre: NDArray[np.float64], bound: float) -> tuple[slice, slice]:
+    """The rows and columns that a ball can cover."""
+    column, row, far = _project(camera, centre)
+    # Near the eye a ball covers more than its radius over its distance.
+    half = camera.focal * bound / max(far - bound, 0.05) + 1
+    return (
+        slice(
+            int(np.clip(row - half, 0, camera.height)),
+            int(np.clip(row + half + 1, 0, camera.height)),
+        ),
+        slice(
+            int(np.clip(column - half, 0, camera.width)),
+            int(np.clip(column + half + 1, 0, camera.width)),
+        ),
+    )
+
+
+# ---------------------------------------------------------------- what is in the picture
+
+
+def _solids(model: mujoco.MjModel, data: mujoco.MjData) -> list[_Solid]:
+    limbs = _limb_colours(model)
+    solids = []
+    for geom in np.flatnonzero(_visible(model)):
+        kind = int(model.geom_type[geom])
+        if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
+            continue
+        body = int(model.geom_bodyid[geom])
+        turn = data.geom_xmat[geom].reshape(3, 3).copy()
+        centre, size = data.geom_xpos[geom].copy(), model.geom_size[geom].copy()
+        if kind not in _HITS:
+            centre, size = centre + turn @ model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
+            kind = int(mujoco.mjtGeom.mjGEOM_BOX)
+        colour = limbs.get(body, model.geom_rgba[geom, :3].astype(np.float64))
+        solids.append(_Solid(kind, centre, turn, size, float(model.geom_rbound[geom]), colour))
+    return solids
+
+
+def _limb_colours(model: mujoco.MjModel) -> dict[int, NDArray[np.float64]]:
+    """A colour for each body that moves: one hue per limb, paler towards its end."""
+    parents = model.body_parentid
+    moving = [b for b in range(1, model.nbody) if model.body_weldid[b] != 0]
+    children: dict[int, int] = {}
+    for body in moving:
+        children[int(parents[body])] = children.get(int(parents[body]), 0) + 1
+    limb: dict[int, int] = {}
+    depth: dict[int, int] = {}
+    n_limbs = 0
+    for body in moving:
+        parent = int(parents[body])
+        if parent not in limb:
+            limb[body], depth[body] = 0, 0
+        elif limb[parent] == 0 or children[parent] > 1:
+            n_limbs += 1
+            limb[body], depth[body] = n_limbs, 0
+        else:
+            limb[body], depth[body] = limb[parent], depth[parent] + 1
+    colours = {}
+    for body in moving:
+        if limb[body] == 0:
+            colours[body] = np.array([0.90, 0.88, 0.84])
+        else:
+            # Steps of the golden ratio keep neighbouring limbs apart in hue.
+            hue = (0.02 + 0.618 * (limb[body] - 1)) % 1.0
+            saturation = max(0.72 - 0.13 * depth[body], 0.3)
+            colours[body] = np.array(colorsys.hsv_to_rgb(hue, saturation, 0.88))
+    return colours
+
+
+def _ground_height(model: mujoco.MjModel, data: mujoco.MjData) -> float:
+    planes = np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if len(planes):
+        return float(data.geom_xpos[planes, 2].max())
+    rest = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, rest)
+    return float((rest.geom_xpos[:, 2] - model.geom_rbound).min(initial=0.0))
+
+
+# ---------------------------------------------------------------- light and colour
+
+
+def _background(
+    camera: _Camera, rays: NDArray[np.float32], ground: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The empty scene [h, w, 3] and the distance of the ground at each pixel [h, w] (metres)."""
+    slope = rays[..., 2]
+    rise = np.clip(slope * 1.6, 0, 1)[..., None]
+    sky = (_SKY_LOW + rise * (_SKY_HIGH - _SKY_LOW)).astype(np.float32)
+    above = camera.eye[2] - ground
+    depth = np.where(slope < -1e-4, above / np.maximum(-slope, 1e-4), np.inf).astype(np.float32)
+    if above <= 0:
+        return sky, np.full_like(depth, np.inf)
+    tile = _tile(camera)
+    far = np.where(np.isfinite(depth), depth, 0)
+    x = (camera.eye[0] + far * rays[..., 0]) / tile
+    y = (camera.eye[1] + far * rays[..., 1]) / tile
+    odd = ((np.floor(x) + np.floor(y)) % 2)[..., None]
+    tiles = _TILE_DARK + odd * (_TILE_LIGHT - _TILE_DARK)
+    # Fog hides the horizon, where the tiles are finer than the pixels.
+    fog = (1 - np.exp(-((far / (14 * camera.reach)) ** 2)))[..., None]
+    floor = tiles + fog * (_SKY_LOW - tiles)
+    return np.where(np.isfinite(depth)[..., None], floor, sky).astype(np.float32), depth
+
+
+def _tile(camera: _Camera) -> float:
+    """Side of a tile in metres: a power of two, near the robot's reach."""
+    return float(2.0 ** np.round(np.log2(max(camera.reach * 0.6, 0.05))))
+
+
+def _shadow(
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    camera: _Camera,
+    rays: NDArray[np.float32],
+    solid: _Solid,
+    ground: float,
+) -> None:
+    """Darkens, in place, the ground that the solid hides from the light."""
+    height = solid.centre[2] - ground
+    if height < 0:
+        return
+    foot = solid.centre - _LIGHT * height / _LIGHT[2]
+    window = _window(camera, foot, solid.bound / _LIGHT[2])
+    far = depth[window]
+    if not far.size:
+        return
+    finite = np.isfinite(far)
+    points = camera.eye + np.where(finite, far, 0)[..., None] * rays[window]
+    hit, _ = _hit(solid, points, _LIGHT)
+    # Overlapping shadows are no darker than one: the colour is pulled down to a floor.
+    shade = finite & np.isfinite(hit) & (image[window].sum(-1) > 1.7)
+    image[window][shade] *= 0.72
+
+
+def _paint(
+    image: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    camera: _Camera,
+    rays: NDArray[np.float32],
+    solid: _Solid,
+) -> None:
+    """Draws, in place, the solid where it is nearer than what is there."""
+    window = _window(camera, solid.centre, solid.bound)
+    directions = rays[window]
+    if not directions.size:
+        return
+    hit, normal = _hit(solid, camera.eye, directions)
+    near = hit < depth[window]
+    facing = normal[near]
+    light = np.clip(facing @ _LIGHT, 0, 1)
+    rim = np.clip(-np.einsum("pc,pc->p", facing, directions[near]), 0, 1)
+    strength = 0.42 + 0.5 * light + 0.16 * rim
+    shine = (
+        0.25
+        * np.clip(
+            facing @ ((_LIGHT - camera.forward) / np.linalg.norm(_LIGHT - camera.forward)), 0, 1
+        )
+        ** 30
+    )
+    # Dark outlines keep limbs apart that overlap in the picture.
+    strength = np.where(rim < 0.25, strength * (0.6 + 1.6 * rim), strength)
+    image[window][near] = strength[:, None] * solid.colour + shine[:, None]
+    depth[window][near] = hit[near]
+
+
+# ---------------------------------------------------------------- rays against solids
+
+
+def _hit(
+    solid: _Solid, origin: NDArray[Any], direction: NDArray[Any]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distance to the solid along rays and its normal there; distance inf where a ray misses.
+
+    ``origin`` and ``direction`` broadcast against each other, [..., 3]; results are [...] and
+    [..., 3].
+    """
+    o = (origin - solid.centre) @ solid.turn
+    d = direction @ solid.turn
+    o, d = np.broadcast_arrays(o, d)
+    distance, normal = _HITS[solid.kind](o, d, solid.size)
+    return distance, normal @ solid.turn.T
+
+
+def _ball(o: Any, d: Any, radius: float) -> Any:
+    b = (o * d).sum(-1)
+    inside = b * b - (o * o).sum(-1) + radius * radius
+    t = -b - np.sqrt(np.maximum(inside, 0))
+    return np.where((inside >= 0) & (t > 0), t, np.inf)
+
+
+def _tube(o: Any, d: Any, radius: float, half: float) -> Any:
+    """The side of a cylinder along z."""
+    a = np.maximum((d[..., :2] ** 2).sum(-1), 1e-12)
+    b = (o[..., :2] * d[..., :2]).sum(-1)
+    inside = b * b - a * ((o[..., :2] ** 2).sum(-1) - radius * radius)
+    t = (-b - np.sqrt(np.maximum(inside, 0))) / a
+    on = np.abs(o[..., 2] + t * d[..., 2]) <= half
+    return np.where((inside >= 0) & (t > 0) & on, t, np.inf)
+
+
+def _at(o: Any, d: Any, t: Any) -> Any:
+    return o + np.where(np.isfinite(t), t, 0)[..., None] * d
+
+
+def _hit_sphere(o: Any, d: Any, size: Any) -> Any:
+    t = _ball(o, d, size[0])
+    return t, _at(o, d, t) / size[0]
+
+
+def _hit_capsule(o: Any, d: Any, size: Any) -> Any:
+    radius, half = size[0], size[1]
+    end = np.array([0, 0, half])
+    t = np.minimum(_tube(o, d, radius, half), _ball(o - end, d, radius))
+    t = np.minimum(t, _ball(o + end, d, radius))
+    point = _at(o, d, t)
+    axis = np.clip(point[..., 2], -half, half)
+    point[..., 2] -= axis
+    return t, point / radius
+
+
+def _hit_cylinder(o: Any, d: Any, size: Any) -> Any:
+    radius, half = size[0], size[1]
+    side = _tube(o, d, radius, half)
+    slope = np.where(np.abs(d[..., 2]) < 1e-9, 1e-9, d[..., 2])
+    cap = (-np.sign(slope) * half - o[..., 2]) / slope
+    on = ((o[..., :2] + cap[..., None] * d[..., :2]) ** 2).sum(-1) <= radius * radius
+    cap = np.where(on & (cap > 0), cap, np.inf)
+    t = np.minimum(side, cap)
+    normal = _at(o, d, t) / radius
+    normal[..., 2] = 0
+    normal[cap < side] = 0
+    normal[..., 2] = np.where(cap < side, -np.sign(slope), 0)
+    return t, normal
+
+
+def _hit_ellipsoid(o: Any, d: Any, size: Any) -> Any:
+    # In units of the half axes it is a ball; there, directions are no longer of unit length.
+    scaled = d / size
+    length = np.sqrt((scaled**2).sum(-1))
+    t = _ball(o / size, scaled / length[..., None], 1.0) / length
+    normal = _at(o, d, t) / size**2
+    return t, normal / np.maximum(np.sqrt((normal**2).sum(-1)), 1e-12)[..., None]
+
+
+def _hit_box(o: Any, d: Any, size: Any) -> Any:
+    slope = np.where(np.abs(d) < 1e-9, 1e-9, d)
+    enter = (-np.sign(slope) * size - o) / slope
+    leave = (np.sign(slope) * size - o) / slope
+    t = enter.max(-1)
+    t = np.where((t <= leave.min(-1)) & (t > 0), t, np.inf)
+    face = np.eye(3)[enter.argmax(-1)]
+    return t, -face * np.sign(slope)
+
+
+_HITS: dict[int, Any] = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): _hit_sphere,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): _hit_capsule,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): _hit_cylinder,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): _hit_ellipsoid,
+    int(mujoco.mjtGeom.mjGEOM_BOX): _hit_box,
+}
+
+
+# ---------------------------------------------------------------- text
+
+
+def _distance_marks(camera: _Camera, ground: float) -> list[tuple[float, float, str]]:
+    """Column, row and text of the metres travelled, along the ground in front of the robot."""
+    tile = _tile(camera)
+    front = camera.eye[1] + 0.62 * (0.0 - camera.eye[1])
+    first = int(np.ceil((camera.eye[0] - 3 * camera.reach) / tile))
+    marks = []
+    for place in range(first, int((camera.eye[0] + 3 * camera.reach) / tile) + 1):
+        column, row, _ = _project(camera, np.array([place * tile, front, ground]))
+        marks.append((column / _OVERSAMPLING, row / _OVERSAMPLING, f"{place * tile:g} m"))
+    return marks
+
+
+def _write(
+    frame: NDArray[np.uint8], marks: list[tuple[float, float, str]], caption: str
+) -> NDArray[np.uint8]:
+    image = Image.fromarray(frame)
+    pen = ImageDraw.Draw(image)
+    height = image.height
+    small = ImageFont.load_default(max(height // 32, 9))
+    for column, row, text in marks:
+        pen.text((column, row), text, fill=(95, 100, 105), font=small, anchor="mm")
+    if caption:
+        font = ImageFont.load_default(max(height // 24, 10))
+        margin = max(height // 45, 4)
+        left, top, right, bottom = pen.textbbox((margin, margin), caption, font=font)
+        pen.rectangle((left - 4, top - 3, right + 4, bottom + 3), fill=(40, 44, 52))
+        pen.text((margin, margin), caption, fill=(255, 255, 255), font=font)
+    return np.asarray(image)

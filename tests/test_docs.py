@@ -1,0 +1,68 @@
+"""Every command that the README and the documents show runs, in their order, at a small size."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from race.cli import COMMANDS, main
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results/README.md"]
+
+# Options given twice count as given last, so that these make any training a short one.
+SMALL = {
+    "train": "--env-steps 700 --learner.random-steps 600 --learner.hidden-sizes 10 8 "
+    "--learner.batch-size 4 --learner.gradient-steps-per-env-step 0.01 --evaluation.episodes 1",
+    "resume": "--env-steps 7000",
+    "evaluate": "--episodes 1",
+    "render": "--seconds 0.3",
+    "bench": "--only env/Hopper*",
+    "plot": "",
+    "list": "",
+    "doctor": "",
+}
+
+
+def shown(document: Path) -> list[str]:
+    """The lines in shell blocks of a document that call `race`."""
+    blocks = re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL)
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    return [
+        line.split("  #")[0].strip() for line in lines if re.match(r"(taskset .* )?race ", line)
+    ]
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_commands_in_documents_run(
+    document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    if document.name != "README.md" or document.parent != ROOT:
+        # Documents after the README may use the run that its first command makes.
+        first = ["train", "mamujoco/HalfCheetah-2x3", "--run-dir", "runs/first"]
+        if any("runs/first" in line for line in shown(document)):
+            main([*first, *shlex.split(SMALL["train"])])
+    for line in shown(document):
+        words = shlex.split(line)
+        words = words[words.index("race") + 1 :]
+        main([*words, *shlex.split(SMALL[words[0]])])
+
+
+def test_the_readme_names_every_command() -> None:
+    text = (ROOT / "README.md").read_text()
+    assert all(f"`race {command}" in text for command in COMMANDS)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_in_documents_lead_somewhere(document: Path) -> None:
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", document.read_text()):
+        assert target.startswith("http") or (document.parent / target).exists(), target
+
+
+def test_make_targets_exist() -> None:
+    targets = re.findall(r"^make (\w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert targets == ["demo", "test"]
+    makefile = (ROOT / "Makefile").read_text()
+    assert all(f"\n{target}:" in makefile for target in targets)
