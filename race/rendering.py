@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -23,6 +24,9 @@ Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 PACKAGES = "apt-get install -y libegl1 libgl1-mesa-dri"
 """What gives a Debian or Ubuntu machine OpenGL without a display."""
+
+SIZE = (480, 360)
+"""Width and height of frames in pixels."""
 
 _MOST_FRAMES_PER_SECOND = 30
 _PROBE = """
@@ -51,7 +55,8 @@ def choose_renderer() -> Renderer:
     """The first of EGL, OSMesa and, with a display, GLFW that draws; else the built-in one.
 
     Each is tried in a process of its own, because a broken OpenGL can end the process. A
-    ``MUJOCO_GL`` that the user has set is tried alone.
+    ``MUJOCO_GL`` that the user has set is tried alone. What is found is put into ``MUJOCO_GL``,
+    which mujoco reads when it is imported: choose before that.
     """
     offered: list[Backend] = ["egl", "osmesa"]
     if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
@@ -62,6 +67,7 @@ def choose_renderer() -> Renderer:
         return Renderer("sketch", f"the built-in renderer, because MUJOCO_GL is {asked!r}")
     for candidate in candidates:
         if _draws(candidate):
+            os.environ["MUJOCO_GL"] = candidate
             return Renderer(candidate, f"OpenGL through {candidate}")
     return Renderer(
         "sketch",
@@ -155,20 +161,19 @@ def _painter(
     from race import sketch
 
     env = task.make(None)
-    simulator = env.unwrapped
-    model, data = getattr(simulator, "model", None), getattr(simulator, "data", None)
-    is_mujoco = isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData)
-    if is_mujoco and renderer.backend == "sketch":
-        return env, lambda caption: sketch.draw(model, data, caption=caption)
+    model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
+    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        if renderer.backend != "sketch":
+            with contextlib.suppress(Exception):  # mujoco took up another backend, or none
+                scene = _opengl(model, data)
+                return env, lambda caption: sketch.with_caption(scene(), caption)
+        return env, lambda caption: sketch.draw(model, data, SIZE, caption)
     env.close()
-    if not is_mujoco and "rgb_array" not in env.metadata.get("render_modes", ()):
+    if "rgb_array" not in env.metadata.get("render_modes", ()):
         raise RenderError(
             f"The environment of {task.spec.task} cannot be drawn: it is not MuJoCo's and offers "
             "no render_mode 'rgb_array'. Add that mode to the environment to make videos of it."
         )
-    if is_mujoco:
-        # gymnasium reads it when it makes its first image.
-        os.environ["MUJOCO_GL"] = renderer.backend
     drawn = task.make("rgb_array")
 
     def paint(caption: str) -> NDArray[np.uint8]:
@@ -178,6 +183,30 @@ def _painter(
         return sketch.with_caption(np.ascontiguousarray(frame[..., :3]), caption)
 
     return drawn, paint
+
+
+def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
+    """Draws with OpenGL, through the same camera as the built-in renderer."""
+    import mujoco
+
+    from race import sketch
+
+    width, height = SIZE
+    opengl = mujoco.Renderer(model, height, width)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    model.vis.global_.fovy = sketch.focus(model, data).field_of_view
+
+    def scene() -> NDArray[np.uint8]:
+        seen = sketch.focus(model, data)
+        camera.lookat[:] = seen.target
+        camera.distance = seen.distance
+        camera.azimuth = math.degrees(math.atan2(-seen.backward[1], -seen.backward[0]))
+        camera.elevation = -math.degrees(math.asin(seen.backward[2]))
+        opengl.update_scene(data, camera)
+        return np.asarray(opengl.render())
+
+    return scene
 
 
 def _step_seconds(env: gymnasium.Env[Any, Any]) -> float:
@@ -213,10 +242,13 @@ def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> 
     count = 0
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with imageio.get_writer(temporary, **options) as writer:
-            for frame in frames:
-                writer.append_data(frame)
-                count += 1
+        with warnings.catch_warnings():
+            # The child becomes ffmpeg at once and touches nothing of JAX.
+            warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
+            with imageio.get_writer(temporary, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)
+                    count += 1
         temporary.rename(path)
     except OSError as error:
         raise RenderError(f"{path} cannot be written: {error}.") from error

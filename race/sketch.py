@@ -89,7 +89,19 @@ def with_caption(frame: UInt8[np.ndarray, "h w 3"], caption: str) -> UInt8[np.nd
 # ---------------------------------------------------------------- camera
 
 
-def _camera(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> _Camera:
+class Focus(NamedTuple):
+    """Where to look from, so that the robot fills the image and stays in it."""
+
+    view: View
+    target: NDArray[np.float64]  # [3], metres
+    reach: float  # metres from the robot's centre to its farthest part, at rest
+    backward: NDArray[np.float64]  # [3], unit vector from the target towards the eye
+    distance: float  # metres from the target to the eye
+    field_of_view: float  # degrees, of the image's shorter side
+
+
+def focus(model: mujoco.MjModel, data: mujoco.MjData) -> Focus:
+    """What a camera that follows the robot looks at."""
     rest = mujoco.MjData(model)
     mujoco.mj_kinematics(model, rest)
     mujoco.mj_comPos(model, rest)
@@ -106,7 +118,12 @@ def _camera(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int)
         target += shift * np.array([1.0, 1.0, 0.5])
     view = _view(model)
     backward = _BACKWARDS[view] / np.linalg.norm(_BACKWARDS[view])
-    distance = 1.25 * reach / np.tan(_HALF_ANGLE)
+    distance = float(1.25 * reach / np.tan(_HALF_ANGLE))
+    return Focus(view, target, reach, backward, distance, float(np.rad2deg(2 * _HALF_ANGLE)))
+
+
+def _camera(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> _Camera:
+    view, target, reach, backward, distance, _ = focus(model, data)
     right = np.array([1.0, 0.0, 0.0]) if view != "corner" else np.cross([0, 0, 1.0], backward)
     right /= np.linalg.norm(right)
     focal = min(width, height) / 2 / np.tan(_HALF_ANGLE)
@@ -130,14 +147,15 @@ def _view(model: mujoco.MjModel) -> View:
 
 def _travellers(model: mujoco.MjModel) -> list[int]:
     """Bodies on the world that can go anywhere: the roots of robots, not the base of an arm."""
-    travelling = (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE)
-    if not model.njnt or model.jnt_type[0] not in travelling:
+    # As numbers: numpy's integers do not equal the members of mujoco's enumerations.
+    travelling = (int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+    if not model.njnt or int(model.jnt_type[0]) not in travelling:
         return []
     return sorted(
         {
             int(body)
             for body, kind in zip(model.jnt_bodyid, model.jnt_type, strict=True)
-            if kind in travelling and model.body_parentid[body] == 0
+            if int(kind) in travelling and model.body_parentid[body] == 0
         }
     )
 

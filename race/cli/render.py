@@ -36,18 +36,20 @@ def main(arguments: list[str]) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from race.cli.compilation import use_cache
-    from race.cli.progress import rounded
     from race.rendering import Episode, choose_renderer, write_video
-    from race.trained import load_trained
 
-    use_cache()
     console = Console(stderr=True)
-    trained = load_trained(chosen.run_dir)
-    policy = trained.policy(chosen.team)
     with console.status("looking for a renderer"):
         renderer = choose_renderer()
     console.print(f"Drawing with: {renderer.reason}", highlight=False, soft_wrap=True)
+    from race.cli.compilation import use_cache
+    from race.cli.progress import rounded
+    from race.trained import load_trained
+
+    use_cache()
+    with console.status("loading the team"):
+        trained = load_trained(chosen.run_dir)
+        policy = trained.policy(chosen.team)
     episode = Episode(trained.task, policy, chosen.seed, chosen.seconds, renderer)
     with Progress(console=console, transient=True) as bar:
         drawing = bar.track(episode.frames(), total=episode.n_frames, description="drawing")
