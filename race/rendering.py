@@ -253,5 +253,6 @@ def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> 
     except OSError as error:
         raise RenderError(f"{path} cannot be written: {error}.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink()
     return count

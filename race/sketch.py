@@ -6,13 +6,15 @@ fast as OpenGL in software does.
 """
 
 import colorsys
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
+
+from race.solids import SHAPES, Solid, hit
 
 Size = tuple[int, int]
 View = Literal["side", "top", "corner"]
@@ -39,15 +41,6 @@ class _Camera(NamedTuple):
     width: int  # pixels, oversampled
     height: int
     reach: float  # metres from the robot's centre to its farthest part, at rest
-
-
-class _Solid(NamedTuple):
-    kind: int  # mujoco.mjtGeom
-    centre: NDArray[np.float64]  # [3]
-    turn: NDArray[np.float64]  # [3, 3], from the solid's frame to the world's
-    size: NDArray[np.float64]  # [3]
-    bound: float  # radius of a ball around the centre that holds the solid
-    colour: NDArray[np.float64]  # [3]
 
 
 def draw(
@@ -210,21 +203,21 @@ def _window(camera: _Camera, centre: NDArray[np.float64], bound: float) -> tuple
 # ---------------------------------------------------------------- what is in the picture
 
 
-def _solids(model: mujoco.MjModel, data: mujoco.MjData) -> list[_Solid]:
+def _solids(model: mujoco.MjModel, data: mujoco.MjData) -> list[Solid]:
     limbs = _limb_colours(model)
     solids = []
     for geom in np.flatnonzero(_visible(model)):
         kind = int(model.geom_type[geom])
-        if kind in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD):
+        if kind in (int(mujoco.mjtGeom.mjGEOM_PLANE), int(mujoco.mjtGeom.mjGEOM_HFIELD)):
             continue
         body = int(model.geom_bodyid[geom])
         turn = data.geom_xmat[geom].reshape(3, 3).copy()
         centre, size = data.geom_xpos[geom].copy(), model.geom_size[geom].copy()
-        if kind not in _HITS:
+        if kind not in SHAPES:
             centre, size = centre + turn @ model.geom_aabb[geom, :3], model.geom_aabb[geom, 3:]
             kind = int(mujoco.mjtGeom.mjGEOM_BOX)
         colour = limbs.get(body, model.geom_rgba[geom, :3].astype(np.float64))
-        solids.append(_Solid(kind, centre, turn, size, float(model.geom_rbound[geom]), colour))
+        solids.append(Solid(kind, centre, turn, size, float(model.geom_rbound[geom]), colour))
     return solids
 
 
@@ -304,7 +297,7 @@ def _shadow(
     depth: NDArray[np.float32],
     camera: _Camera,
     rays: NDArray[np.float32],
-    solid: _Solid,
+    solid: Solid,
     ground: float,
 ) -> None:
     """Darkens, in place, the ground that the solid hides from the light."""
@@ -318,9 +311,9 @@ def _shadow(
         return
     finite = np.isfinite(far)
     points = camera.eye + np.where(finite, far, 0)[..., None] * rays[window]
-    hit, _ = _hit(solid, points, _LIGHT)
+    blocked, _ = hit(solid, points, _LIGHT)
     # Overlapping shadows are no darker than one: the colour is pulled down to a floor.
-    shade = finite & np.isfinite(hit) & (image[window].sum(-1) > 1.7)
+    shade = finite & np.isfinite(blocked) & (image[window].sum(-1) > 1.7)
     image[window][shade] *= 0.72
 
 
@@ -329,15 +322,15 @@ def _paint(
     depth: NDArray[np.float32],
     camera: _Camera,
     rays: NDArray[np.float32],
-    solid: _Solid,
+    solid: Solid,
 ) -> None:
     """Draws, in place, the solid where it is nearer than what is there."""
     window = _window(camera, solid.centre, solid.bound)
     directions = rays[window]
     if not directions.size:
         return
-    hit, normal = _hit(solid, camera.eye, directions)
-    near = hit < depth[window]
+    distance, normal = hit(solid, camera.eye, directions)
+    near = distance < depth[window]
     facing = normal[near]
     light = np.clip(facing @ _LIGHT, 0, 1)
     rim = np.clip(-np.einsum("pc,pc->p", facing, directions[near]), 0, 1)
@@ -352,108 +345,7 @@ def _paint(
     # Dark outlines keep limbs apart that overlap in the picture.
     strength = np.where(rim < 0.25, strength * (0.6 + 1.6 * rim), strength)
     image[window][near] = strength[:, None] * solid.colour + shine[:, None]
-    depth[window][near] = hit[near]
-
-
-# ---------------------------------------------------------------- rays against solids
-
-
-def _hit(
-    solid: _Solid, origin: NDArray[Any], direction: NDArray[Any]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distance to the solid along rays and its normal there; distance inf where a ray misses.
-
-    ``origin`` and ``direction`` broadcast against each other, [..., 3]; results are [...] and
-    [..., 3].
-    """
-    o = (origin - solid.centre) @ solid.turn
-    d = direction @ solid.turn
-    o, d = np.broadcast_arrays(o, d)
-    distance, normal = _HITS[solid.kind](o, d, solid.size)
-    return distance, normal @ solid.turn.T
-
-
-def _ball(o: Any, d: Any, radius: float) -> Any:
-    b = (o * d).sum(-1)
-    inside = b * b - (o * o).sum(-1) + radius * radius
-    t = -b - np.sqrt(np.maximum(inside, 0))
-    return np.where((inside >= 0) & (t > 0), t, np.inf)
-
-
-def _tube(o: Any, d: Any, radius: float, half: float) -> Any:
-    """The side of a cylinder along z."""
-    a = np.maximum((d[..., :2] ** 2).sum(-1), 1e-12)
-    b = (o[..., :2] * d[..., :2]).sum(-1)
-    inside = b * b - a * ((o[..., :2] ** 2).sum(-1) - radius * radius)
-    t = (-b - np.sqrt(np.maximum(inside, 0))) / a
-    on = np.abs(o[..., 2] + t * d[..., 2]) <= half
-    return np.where((inside >= 0) & (t > 0) & on, t, np.inf)
-
-
-def _at(o: Any, d: Any, t: Any) -> Any:
-    return o + np.where(np.isfinite(t), t, 0)[..., None] * d
-
-
-def _hit_sphere(o: Any, d: Any, size: Any) -> Any:
-    t = _ball(o, d, size[0])
-    return t, _at(o, d, t) / size[0]
-
-
-def _hit_capsule(o: Any, d: Any, size: Any) -> Any:
-    radius, half = size[0], size[1]
-    end = np.array([0, 0, half])
-    t = np.minimum(_tube(o, d, radius, half), _ball(o - end, d, radius))
-    t = np.minimum(t, _ball(o + end, d, radius))
-    point = _at(o, d, t)
-    axis = np.clip(point[..., 2], -half, half)
-    point[..., 2] -= axis
-    return t, point / radius
-
-
-def _hit_cylinder(o: Any, d: Any, size: Any) -> Any:
-    radius, half = size[0], size[1]
-    side = _tube(o, d, radius, half)
-    slope = np.where(np.abs(d[..., 2]) < 1e-9, 1e-9, d[..., 2])
-    cap = (-np.sign(slope) * half - o[..., 2]) / slope
-    on = ((o[..., :2] + cap[..., None] * d[..., :2]) ** 2).sum(-1) <= radius * radius
-    cap = np.where(on & (cap > 0), cap, np.inf)
-    t = np.minimum(side, cap)
-    normal = _at(o, d, t) / radius
-    normal[..., 2] = 0
-    normal[cap < side] = 0
-    normal[..., 2] = np.where(cap < side, -np.sign(slope), 0)
-    return t, normal
-
-
-def _hit_ellipsoid(o: Any, d: Any, size: Any) -> Any:
-    # In units of the half axes it is a ball; there, directions are no longer of unit length.
-    scaled = d / size
-    length = np.sqrt((scaled**2).sum(-1))
-    t = _ball(o / size, scaled / length[..., None], 1.0) / length
-    normal = _at(o, d, t) / size**2
-    return t, normal / np.maximum(np.sqrt((normal**2).sum(-1)), 1e-12)[..., None]
-
-
-def _hit_box(o: Any, d: Any, size: Any) -> Any:
-    slope = np.where(np.abs(d) < 1e-9, 1e-9, d)
-    enter = (-np.sign(slope) * size - o) / slope
-    leave = (np.sign(slope) * size - o) / slope
-    t = enter.max(-1)
-    t = np.where((t <= leave.min(-1)) & (t > 0), t, np.inf)
-    face = np.eye(3)[enter.argmax(-1)]
-    return t, -face * np.sign(slope)
-
-
-_HITS: dict[int, Any] = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): _hit_sphere,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): _hit_capsule,
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): _hit_cylinder,
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): _hit_ellipsoid,
-    int(mujoco.mjtGeom.mjGEOM_BOX): _hit_box,
-}
-
-
-# ---------------------------------------------------------------- text
+    depth[window][near] = distance[near]
 
 
 def _distance_marks(camera: _Camera, ground: float) -> list[tuple[float, float, str]]:
