@@ -5,6 +5,7 @@ run and read back by every other command, so a run directory explains itself.
 """
 
 import dataclasses
+import math
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
@@ -301,6 +302,8 @@ def _check(config: Config) -> None:
         (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
     ]
     for holds, name, value, must in rules:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
         if not holds:
             raise ConfigError(f"--{name} is {value}, but it must be {must}.")
 

@@ -86,10 +86,9 @@ class TrainingDisplay:
 def _covered(progress: Progress) -> float:
     """Environment steps, those of the current generation counted as their gradient steps go."""
     if not progress.learning:
-        return progress.env_steps
-    collected = progress.env_steps - progress.env_steps_before
+        return float(progress.env_steps)
     learned = progress.gradient_steps - progress.gradient_steps_before
-    return min(progress.env_steps_before + learned, progress.env_steps_before + collected)
+    return float(min(progress.env_steps_before + learned, progress.env_steps))
 
 
 def _test_summary(row: dict[str, Any]) -> str:

@@ -79,12 +79,9 @@ def main(arguments: list[str]) -> None:
 
 def _parse(arguments: list[str]) -> Train:
     # Twice, because the preset is itself an argument: what it sets is a default, not a command.
-    def parse(default: Train) -> Train:
-        return tyro.cli(Train, args=arguments, prog="race train", default=default)
-
-    empty = Train(task=tyro.MISSING)
-    preset = parse(empty).preset
-    return parse(dataclasses.replace(empty, learner=PRESETS[preset]))
+    first = tyro.cli(Train, args=arguments, prog="race train")
+    default = Train(task=first.task, learner=PRESETS[first.preset])
+    return tyro.cli(Train, args=arguments, prog="race train", default=default)
 
 
 def _name(config: Config) -> str:

@@ -1,0 +1,219 @@
+"""The commands, with good and with bad input."""
+
+import json
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from race import checkpoints, metrics
+from race.cli import COMMANDS, main
+
+SMALL = (
+    "--env-steps 120 --learner.random-steps 40 --learner.hidden-sizes 12 8 --learner.batch-size 8 "
+    "--race.policy-embedding-size 4 --race.mine-size 6 --evaluation.every 60 "
+    "--evaluation.episodes 2"
+)
+
+
+def race(command: str) -> None:
+    main(command.split())
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "race"
+    race(f"train probe/terminates --run-dir {path} {SMALL}")
+    return path
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A finished run that a test may damage."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def fails(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    """Runs a command that must fail with a message; returns it."""
+    with pytest.raises(SystemExit) as stopped:
+        race(command)
+    assert stopped.value.code in (1, 2)
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    return " ".join(error.split())
+
+
+def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    race("--help")
+    overview = capsys.readouterr().out
+    assert all(name in overview for name in COMMANDS)
+    race("--version")
+    assert re.fullmatch(r"race \d+\.\d+\.\d+\n", capsys.readouterr().out)
+    assert "Did you mean `race train`" in fails("trian", capsys)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        race(f"{command} --help")
+    assert stopped.value.code == 0
+    assert f"race {command}" in capsys.readouterr().out
+
+
+def test_a_run_directory_holds_what_it_should(trained: Path) -> None:
+    assert {"config.json", "metadata.json", "metrics.jsonl", "checkpoints", "DONE"} <= {
+        path.name for path in trained.iterdir()
+    }
+    config = json.loads((trained / "config.json").read_text())
+    assert (config["task"], config["algo"], config["env_steps"]) == (
+        "probe/terminates",
+        "race",
+        120,
+    )
+    metadata = json.loads((trained / "metadata.json").read_text())
+    assert "jax" in str(metadata)
+    for row in metrics.read(trained / "metrics.jsonl"):
+        assert {"kind", "env_steps", "gradient_steps", "generation", "wall_seconds"} <= set(row)
+
+
+def test_presets_are_defaults_and_flags_win(tmp_path: Path) -> None:
+    race(f"train probe/terminates --preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {SMALL}")
+    learner = json.loads((tmp_path / "a" / "config.json").read_text())["learner"]
+    assert learner["actor_learning_rate"] == 3e-4  # from the preset
+    assert learner["batch_size"] == 8  # from the flags
+    assert learner["policy_delay"] == 1  # MADDPG's
+
+
+def test_evaluate(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = {}
+    for team in ("marl", "champion", "selected"):
+        race(f"evaluate {trained} --team {team} --episodes 23 --seed 5 --json")
+        results[team] = json.loads(capsys.readouterr().out)
+        assert len(results[team]["returns"]) == 23
+        assert results[team]["return_mean"] == pytest.approx(5.0)
+    assert results["selected"]["played"] in ("marl", "champion")
+    race(f"evaluate {trained} --episodes 3")
+    assert "return over 3 episodes: 5" in capsys.readouterr().out
+
+
+def test_resume_extends_a_finished_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "has finished" in fails(f"resume {run}", capsys)
+    assert "more than that" in fails(f"resume {run} --env-steps 100", capsys)
+    before = metrics.read(run / "metrics.jsonl")
+    race(f"resume {run} --env-steps 200")
+    after = metrics.read(run / "metrics.jsonl")
+    assert after[: len(before)] == before
+    assert after[-1]["env_steps"] >= 200
+    assert json.loads((run / "config.json").read_text())["env_steps"] == 200
+    assert (run / "DONE").exists()
+
+
+def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    race("list --json")
+    listing = json.loads(capsys.readouterr().out)
+    tasks = {task["id"]: task for task in listing["tasks"]}
+    assert (tasks["mamujoco/Ant-2x4d"]["alpha"], tasks["mamujoco/Ant-2x4d"]["beta"]) == (0.2, 1e-2)
+    assert sum(task["paper_name"] is not None for task in tasks.values()) == 8
+    assert set(listing["algorithms"]) == {"race", "matd3", "maddpg"}
+    race("list")
+    assert "mamujoco/HumanoidStandup-9x8" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "hint"),
+    [
+        ("train mamujoco/HalfCheetah-2x4", "HalfCheetah-2x3"),
+        ("train mamujoco/HalfCheeta-2x3", "HalfCheetah-2x3"),
+        ("train HalfCheetah", "mamujoco/HalfCheetah"),
+        ("train no_such_module:make", "no_such_module"),
+        ("train probe/chain --race.population-size 1", "at least 4"),
+        ("train probe/chain --learner.batch-size 64 --learner.replay-capacity 32", "no larger"),
+        ("train probe/chain --env-steps -5", "at least 1"),
+        ("train probe/chain --learner.discount 1.5", "[0, 1)"),
+        ("train probe/chain --learner.gradient-clip nan", "finite"),
+        ("train probe/chain --race.vmm-weight nan", "finite"),
+        ("train probe/chain --checkpoint.minutes nan", "finite"),
+        ("train probe/chain --learner.actor-learning-rate inf", "finite"),
+        ("train probe/chain --seed -1", "from 0"),
+        ("train probe/chain --algo sarsa", "sarsa"),
+        ("train probe/chain --learner.batch-size many", "many"),
+        ("train", "required"),
+        ("train probe/chain --no-such-flag 3", "no-such-flag"),
+        ("evaluate nowhere", "not the directory of a run"),
+        ("resume nowhere", "not the directory of a run"),
+        ("render nowhere", "not the directory of a run"),
+        ("render nowhere --out team.avi", ".mp4 or .gif"),
+        ("plot", "which runs"),
+        ("plot nowhere", "not a directory"),
+    ],
+)
+def test_bad_input_gets_a_message_and_leaves_nothing(
+    command: str,
+    hint: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert hint in fails(command, capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_to_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(f"train probe/chain --run-dir {run} {SMALL}", capsys)
+    assert f"race resume {run}" in message
+    assert "at least 1" in fails(f"evaluate {run} --episodes 0", capsys)
+    assert "rgb_array" in fails(f"render {run} --out {run / 'team.mp4'}", capsys)
+    assert "Nearest" in fails(f"plot {run} --metric retrun --out {run / 'a.png'}", capsys)
+
+
+def test_a_champion_needs_a_population(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {SMALL}")
+    capsys.readouterr()
+    assert "no population" in fails(f"evaluate {tmp_path / 'run'} --team champion", capsys)
+
+
+def damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(bytes(content))
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+@pytest.mark.parametrize("how", [damage, truncate, Path.unlink])
+@pytest.mark.parametrize("file", ["arrays.safetensors", "manifest.json"])
+def test_a_damaged_checkpoint_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], how: Any, file: str
+) -> None:
+    newest = checkpoints.newest(run / "checkpoints")
+    assert newest is not None
+    how(newest / file)
+    rows = (run / "metrics.jsonl").read_bytes()
+    for command in (f"resume {run} --env-steps 500", f"evaluate {run}", f"render {run}"):
+        assert newest.name in fails(command, capsys)
+    assert (run / "metrics.jsonl").read_bytes() == rows
+
+
+def test_a_checkpoint_of_another_run_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    race(f"train probe/chain --run-dir {tmp_path / 'other'} {SMALL}")
+    shutil.rmtree(run / "checkpoints")
+    shutil.copytree(tmp_path / "other" / "checkpoints", run / "checkpoints")
+    capsys.readouterr()
+    assert "checkpoint" in fails(f"resume {run} --env-steps 500", capsys)
+    assert "checkpoint" in fails(f"evaluate {run}", capsys)
+
+
+def test_a_config_of_another_program_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "config.json").write_text('{"some": "thing"}')
+    for command in ("resume", "evaluate", "render", "plot"):
+        assert "config" in fails(f"{command} {run}", capsys)
