@@ -15,7 +15,7 @@ DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "
 SMALL = {
     "train": "--env-steps 700 --learner.random-steps 600 --learner.hidden-sizes 10 8 "
     "--learner.batch-size 4 --learner.gradient-steps-per-env-step 0.01 --evaluation.episodes 1",
-    "resume": "--env-steps 7000",
+    "resume": "--env-steps 13000",
     "evaluate": "--episodes 1",
     "render": "--seconds 0.3",
     "bench": "--only env/Hopper*",
@@ -43,7 +43,7 @@ def test_commands_in_documents_run(
         # Documents after the README may use the run that its first command makes.
         first = ["train", "mamujoco/HalfCheetah-2x3", "--run-dir", "runs/first"]
         if any("runs/first" in line for line in shown(document)):
-            main([*first, *shlex.split(SMALL["train"])])
+            main([*first, *shlex.split(SMALL["train"]), "--env-steps", "7000"])
     for line in shown(document):
         words = shlex.split(line)
         words = words[words.index("race") + 1 :]
