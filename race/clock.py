@@ -39,7 +39,7 @@ class Clock:
             progress=dataclasses.replace(
                 progress,
                 wall_seconds=progress.wall_seconds + passed,
-                generation_seconds=progress.generation_seconds + passed * add,
+                generation_seconds=progress.generation_seconds + (passed if add else 0.0),
             )
         )
 

@@ -1,19 +1,22 @@
-"""Every setting of a run, with the paper's symbol beside it, and the presets.
+"""Every setting of a run, with the paper's symbol beside it.
 
 A `Config` is frozen and passed explicitly. It is written to ``config.json`` at the start of a
 run and read back by every other command, so a run directory explains itself.
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import tyro
 
 from race.errors import ConfigError
 
 Algo = Literal["race", "matd3", "maddpg"]
 Base = Literal["matd3", "maddpg"]
 Preset = Literal["paper", "td3", "demo"]
+TeamName = Literal["marl", "champion", "selected"]
 
 
 @dataclass(frozen=True)
@@ -72,14 +75,32 @@ class RaceConfig:
     """Units of the MINE networks (Appendix A.1)."""
 
 
+def _depths(words: list[str]) -> tuple[tuple[str, ...], ...]:
+    return tuple(tuple(word.split(",")) for word in words)
+
+
+Categories = Annotated[
+    tuple[tuple[str, ...], ...],
+    # On the command line one word per distance: --env.local-categories qpos,qvel qpos
+    tyro.constructors.PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="NAME,NAME...",
+        instance_from_str=_depths,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda value: [",".join(depth) for depth in value],
+    ),
+]
+
+
 @dataclass(frozen=True)
 class EnvConfig:
     """What an agent of a Multi-Agent MuJoCo task observes, and where environments run."""
 
     agent_obsk: int = 0
     """Observe joints up to this distance; 0 is the agent's own joints only (Section 4.1)."""
-    local_categories: tuple[tuple[str, ...], ...] = (("qpos", "qvel"),)
-    """What is observed of the joints at each distance 0, 1, ...; the last repeats."""
+    local_categories: Categories = (("qpos", "qvel"),)
+    """What is observed of the joints at each distance 0, 1, ..., such as: qpos,qvel qpos. The last
+    repeats."""
     global_categories: tuple[str, ...] = ()
     """What is observed of the torso."""
     library_observation: bool = False
@@ -135,179 +156,6 @@ class Config:
         return f"RACE({self.base.upper()})" if self.algo == "race" else self.algo.upper()
 
 
-# Table 3: (alpha, beta) of RACE(MATD3) on Multi-Agent MuJoCo.
-TABLE_3: dict[str, tuple[float, float]] = {
-    "mamujoco/HalfCheetah-2x3": (0.7, 1e-1),
-    "mamujoco/HalfCheetah-6x1": (0.5, 1e-2),
-    "mamujoco/Ant-2x4": (0.7, 1e-2),
-    "mamujoco/Ant-2x4d": (0.2, 1e-2),
-    "mamujoco/Ant-4x2": (0.2, 1e-3),
-    "mamujoco/Hopper-3x1": (1.0, 1e-1),
-    "mamujoco/Humanoid-9x8": (0.7, 1e-2),
-    "mamujoco/HumanoidStandup-9x8": (1.0, 1e-3),
-}
-
-# Presets of the gradient learner. "td3": the values of the official TD3 code. "demo": smaller
-# networks and fewer random steps, to see a team learn within minutes; not for comparisons.
-PRESETS: dict[str, LearnerConfig] = {
-    "paper": LearnerConfig(),
-    "td3": LearnerConfig(
-        batch_size=256,
-        actor_learning_rate=3e-4,
-        critic_learning_rate=3e-4,
-        random_steps=25_000,
-    ),
-    "demo": LearnerConfig(hidden_sizes=(160, 120), random_steps=3_000),
-}
-
-
-def resolve(config: Config) -> Config:
-    """Fills what was left to presets and checks every value.
-
-    ``--algo maddpg`` is the MADDPG learner whatever ``base`` says, and likewise ``matd3``.
-
-    Raises:
-        ConfigError: naming the first setting that cannot work, and what would.
-    """
-    alpha, beta = TABLE_3.get(config.task, (0.5, 1e-2))
-    race = config.race
-    if race.mutation_fraction is None:
-        race = dataclasses.replace(race, mutation_fraction=alpha)
-    if race.vmm_weight is None:
-        race = dataclasses.replace(race, vmm_weight=beta)
-    base: Base = config.base if config.algo == "race" else config.algo
-    learner = config.learner
-    if base == "maddpg":
-        learner = dataclasses.replace(learner, policy_delay=1, smoothing_noise=0.0)
-    config = dataclasses.replace(config, race=race, base=base, learner=learner)
-    _check(config)
-    return config
-
-
-def _check(config: Config) -> None:
-    learner, race = config.learner, config.race
-    assert race.mutation_fraction is not None
-    assert race.vmm_weight is not None
-    rules: list[tuple[bool, str, Any, str]] = [
-        (config.env_steps >= 1, "env-steps", config.env_steps, "at least 1"),
-        (0 <= config.seed < 2**31, "seed", config.seed, "from 0 to 2147483647"),
-        (min(learner.hidden_sizes) >= 1, "learner.hidden-sizes", learner.hidden_sizes, "positive"),
-        (learner.batch_size >= 2, "learner.batch-size", learner.batch_size, "at least 2"),
-        (
-            learner.batch_size <= learner.replay_capacity,
-            "learner.batch-size",
-            learner.batch_size,
-            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
-        ),
-        (
-            max(learner.random_steps, 1) <= learner.replay_capacity,
-            "learner.random-steps",
-            learner.random_steps,
-            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
-        ),
-        (learner.random_steps >= 0, "learner.random-steps", learner.random_steps, "0 or more"),
-        (
-            learner.actor_learning_rate > 0,
-            "learner.actor-learning-rate",
-            learner.actor_learning_rate,
-            "above 0",
-        ),
-        (
-            learner.critic_learning_rate > 0,
-            "learner.critic-learning-rate",
-            learner.critic_learning_rate,
-            "above 0",
-        ),
-        (learner.gradient_clip > 0, "learner.gradient-clip", learner.gradient_clip, "above 0"),
-        (0 <= learner.discount < 1, "learner.discount", learner.discount, "in [0, 1)"),
-        (
-            0 < learner.target_update_rate <= 1,
-            "learner.target-update-rate",
-            learner.target_update_rate,
-            "in (0, 1]",
-        ),
-        (learner.policy_delay >= 1, "learner.policy-delay", learner.policy_delay, "at least 1"),
-        (
-            learner.exploration_noise >= 0,
-            "learner.exploration-noise",
-            learner.exploration_noise,
-            "0 or more",
-        ),
-        (
-            learner.smoothing_noise >= 0,
-            "learner.smoothing-noise",
-            learner.smoothing_noise,
-            "0 or more",
-        ),
-        (
-            learner.smoothing_clip >= 0,
-            "learner.smoothing-clip",
-            learner.smoothing_clip,
-            "0 or more",
-        ),
-        (
-            0 < learner.gradient_steps_per_env_step <= 100,
-            "learner.gradient-steps-per-env-step",
-            learner.gradient_steps_per_env_step,
-            "in (0, 100]",
-        ),
-        (
-            race.population_size >= 4,
-            "race.population-size",
-            race.population_size,
-            "at least 4: an elite, a second parent, a team for their offspring and one for the "
-            "injected MARL team (for no population use --algo matd3)",
-        ),
-        (
-            0 <= race.mutation_fraction <= 1,
-            "race.mutation-fraction",
-            race.mutation_fraction,
-            "in [0, 1]",
-        ),
-        (race.vmm_weight >= 0, "race.vmm-weight", race.vmm_weight, "0 or more"),
-        (
-            0 <= race.mutation_probability <= 1,
-            "race.mutation-probability",
-            race.mutation_probability,
-            "in [0, 1]",
-        ),
-        (
-            0 <= race.agent_mutation_probability <= 1,
-            "race.agent-mutation-probability",
-            race.agent_mutation_probability,
-            "in [0, 1]",
-        ),
-        (race.tournament_size >= 1, "race.tournament-size", race.tournament_size, "at least 1"),
-        (
-            race.policy_embedding_size >= 1,
-            "race.policy-embedding-size",
-            race.policy_embedding_size,
-            "at least 1",
-        ),
-        (race.mine_size >= 1, "race.mine-size", race.mine_size, "at least 1"),
-        (config.env.agent_obsk >= 0, "env.agent-obsk", config.env.agent_obsk, "0 or more"),
-        (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
-        (
-            config.evaluation.episodes >= 1,
-            "evaluation.episodes",
-            config.evaluation.episodes,
-            "at least 1",
-        ),
-        (
-            config.checkpoint.minutes >= 0,
-            "checkpoint.minutes",
-            config.checkpoint.minutes,
-            "0 or more",
-        ),
-        (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
-    ]
-    for holds, name, value, must in rules:
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
-        if not holds:
-            raise ConfigError(f"--{name} is {value}, but it must be {must}.")
-
-
 def to_json(config: Any) -> dict[str, Any]:
     """A config as plain JSON values; `from_json` is its inverse."""
     return dataclasses.asdict(config)
@@ -333,17 +181,33 @@ def _build(cls: Any, data: Any) -> Any:
         )
     values = {}
     for name, value in data.items():
-        hint = hints[name]
-        if dataclasses.is_dataclass(hint):
-            values[name] = _build(hint, value)
-        elif get_origin(hint) is tuple:
-            values[name] = _tuple(value)
-        elif get_origin(hint) is Literal and value not in get_args(hint):
-            raise ConfigError(f"The saved configuration names {name} {value!r}, unknown here.")
-        else:
-            values[name] = value
+        if dataclasses.is_dataclass(hints[name]):
+            values[name] = _build(hints[name], value)
+            continue
+        values[name] = _tuple(value)
+        if not _fits(values[name], hints[name]):
+            raise ConfigError(
+                f"The saved configuration has {name} {value!r}, which is not what this version of "
+                "race understands by it."
+            )
     return cls(**values)
 
 
 def _tuple(value: Any) -> Any:
     return tuple(_tuple(v) for v in value) if isinstance(value, list) else value
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return value in arguments
+    if origin is UnionType:
+        return any(_fits(value, argument) for argument in arguments)
+    if origin is tuple:
+        if not isinstance(value, tuple):
+            return False
+        items = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
+        return len(items) == len(value) and all(map(_fits, value, items))
+    if hint is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is (hint or type(None))

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from race import __version__
+from race.metadata import DISTRIBUTION
 from race.rendering import PACKAGES, choose_renderer
-from race.run_directory import DISTRIBUTION
 
 Status = Literal["ok", "warning", "missing"]
 
@@ -89,7 +89,7 @@ def _accelerator() -> Finding:
             "accelerator",
             "warning",
             f"JAX uses {kinds}, though this machine has an NVIDIA driver",
-            "pip install 'race-marl[cuda]'",
+            "pip install 'jax[cuda12]'",
         )
     return Finding("accelerator", "ok", f"JAX {jax.__version__} on {kinds}")
 

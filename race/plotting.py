@@ -1,11 +1,12 @@
 """Learning curves: runs of one method aggregated, one panel per task."""
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -78,8 +79,10 @@ def plot(
     if out.suffix.lower() not in FORMATS:
         raise RaceError(f"{out} cannot be drawn: the name must end with {', '.join(FORMATS)}.")
     runs = [(path, run_directory.open_run(path)) for path in _expand(directories)]
+    _refuse_twins(runs)
+    names = _names([config for _, config in runs])
     curves: dict[str, dict[tuple[str, str], list[Curve]]] = {}
-    for path, config in runs:
+    for (path, config), method in zip(runs, names, strict=True):
         rows = metrics.read(RunDirectory(path).metrics)
         if not rows:
             raise RunDirectoryError(
@@ -87,9 +90,9 @@ def plot(
                 "is over."
             )
         for label, key in _keys(metric, team, config).items():
-            name = config.method if len(label) == 0 else f"{config.method}, {label}"
+            name = f"{method}, {label}" if label else method
             curve = _curve(path, rows, key, metric)
-            curves.setdefault(config.task, {}).setdefault((config.method, name), []).append(curve)
+            curves.setdefault(config.task, {}).setdefault((method, name), []).append(curve)
     figure = Figure(figsize=(6.4 * min(len(curves), 3), 4.4 * math.ceil(len(curves) / 3)))
     FigureCanvasAgg(figure)
     found = []
@@ -137,9 +140,49 @@ def _expand(directories: Sequence[Path]) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
+def _settings(config: Config) -> dict[str, Any]:
+    """What makes two runs the same experiment: everything but seed, length and bookkeeping."""
+    kept = dataclasses.asdict(config)
+    for name in ("seed", "env_steps", "checkpoint"):
+        del kept[name]
+    del kept["env"]["processes"]
+    return {
+        f"{group}.{name}" if isinstance(values, dict) else group: value
+        for group, values in kept.items()
+        for name, value in (values.items() if isinstance(values, dict) else [("", values)])
+    }
+
+
+def _refuse_twins(runs: Sequence[tuple[Path, Config]]) -> None:
+    seen: dict[tuple[int, str], Path] = {}
+    for path, config in runs:
+        twin = seen.setdefault((config.seed, repr(_settings(config))), path)
+        if twin != path:
+            raise RaceError(
+                f"{twin} and {path} are the same experiment with the same seed {config.seed}; "
+                "counted as two seeds they would make the interval too narrow. Name one of them."
+            )
+
+
+def _names(configs: Sequence[Config]) -> list[str]:
+    """Each run's method, with the settings in which runs of one method and task differ."""
+    names = []
+    for config in configs:
+        mine = _settings(config)
+        rivals = [
+            _settings(other)
+            for other in configs
+            if (other.task, other.method) == (config.task, config.method)
+        ]
+        differ = [key for key in mine if any(rival[key] != mine[key] for rival in rivals)]
+        settings = ", ".join(f"{key}={mine[key]}" for key in differ)
+        names.append(f"{config.method} {settings}" if settings else config.method)
+    return names
+
+
 def _keys(metric: str, team: str, config: Config) -> dict[str, str]:
     """Keys of the rows to draw, by the label that tells a method's curves apart."""
-    if "/" in metric:
+    if "/" in metric or metric == "wall_seconds" or metric == "gradient_steps":
         return {"": metric}
     if team == "all" and config.has_population:
         return {_LABELS[name]: f"eval/{name}/{metric}" for name in TEAMS}

@@ -6,7 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses, Teams
@@ -118,3 +118,10 @@ def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: EnvSpec, config: Con
     """The state of an algorithm before its first step."""
     TRACES["start"] += 1
     return algorithm.init(key, spec, config)
+
+
+@jax.jit
+def all_finite(state: Any) -> Bool[Array, ""]:
+    """Whether every number of a state is finite."""
+    leaves = [leaf for leaf in jax.tree.leaves(state) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))

@@ -9,7 +9,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, final, get_args
 
 import gymnasium
 import imageio
@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.errors import RenderError
+from race.rollouts.host import in_units
 from race.types import Task
 
 Backend = Literal["egl", "osmesa", "glfw", "sketch"]
@@ -94,6 +95,7 @@ def _draws(backend: str) -> bool:
     return done.returncode == 0 and "drawn" in done.stdout
 
 
+@final
 class Episode:
     """One episode of a team, drawn as it is played.
 
@@ -101,7 +103,7 @@ class Episode:
 
     Attributes:
         fps: frames per second for playback in real time.
-        seconds: the longest it can last in the simulation's time.
+        n_frames: the most frames it can have.
     """
 
     def __init__(
@@ -127,7 +129,6 @@ class Episode:
         limit = task.spec.episode_limit
         self._steps = min(limit, math.ceil(seconds / step_seconds)) if seconds > 0 else limit
         self.n_frames = self._steps // self._stride + 1
-        self.seconds = self._steps * step_seconds
         self.episode_return = 0.0
         self.steps = 0
 
@@ -140,7 +141,7 @@ class Episode:
             yield self._paint(self._caption())
             for step in range(self._steps):
                 action = self._policy(np.asarray(state, np.float32))
-                units = np.where(low == -high, action * high, low + (action + 1) / 2 * (high - low))
+                units = in_units(np.clip(action, -1, 1), low, high)
                 state, reward, terminated, truncated, _ = self._env.step(units)
                 self.episode_return += float(reward)
                 self.steps = step + 1

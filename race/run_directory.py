@@ -1,31 +1,19 @@
-"""The directory of a run: what lies where, who may write to it, and where the run came from."""
+"""The directory of a run: what lies where, and who may write to it."""
 
 import contextlib
 import fcntl
-import importlib.metadata
 import json
 import os
-import platform
-import re
-import subprocess
-import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import jax
-
-from race import __version__
 from race import config as configs
 from race.config import Config
 from race.errors import ConfigError, RunDirectoryError
-
-DISTRIBUTION = "race-marl"
-
-_REQUIREMENT = re.compile(r"([\w.-]+)\s*(?:\[([^\]]*)\])?")
-_EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)")
+from race.metadata import metadata
+from race.presets import resolve
 
 
 @dataclass(frozen=True)
@@ -115,9 +103,7 @@ def change_config(path: Path, config: Config) -> None:
     try:
         _write(file, _json(configs.to_json(config)))
     except OSError as error:
-        raise RunDirectoryError(
-            f"{file} cannot be written: {error}. See that it is writable and the disk is not full."
-        ) from error
+        raise _unwritable(file, error) from error
 
 
 def open_run(path: Path) -> Config:
@@ -131,7 +117,7 @@ def open_run(path: Path) -> Config:
         data = json.loads(file.read_text(encoding="utf-8"))
         if not isinstance(data, dict):
             raise ValueError("no object")
-        return configs.from_json(data)
+        return resolve(configs.from_json(data))
     except (FileNotFoundError, NotADirectoryError) as error:
         raise RunDirectoryError(
             f"{path} is not the directory of a run: it has no config.json. Give the directory that "
@@ -154,8 +140,15 @@ def open_run(path: Path) -> Config:
 
 
 def mark_finished(path: Path) -> None:
-    """Records that the run has used its whole budget."""
-    _write(RunDirectory(path).done, "")
+    """Records that the run has used its whole budget.
+
+    Raises:
+        RunDirectoryError: if that cannot be written.
+    """
+    try:
+        _write(RunDirectory(path).done, "")
+    except OSError as error:
+        raise _unwritable(RunDirectory(path).done, error) from error
 
 
 def is_finished(path: Path) -> bool:
@@ -164,9 +157,22 @@ def is_finished(path: Path) -> bool:
 
 
 def clear_finished(path: Path) -> None:
-    """Takes `mark_finished` back, as when the budget is extended."""
-    RunDirectory(path).done.unlink(missing_ok=True)
-    _sync_folder(path)
+    """Takes `mark_finished` back, as when the budget is extended.
+
+    Raises:
+        RunDirectoryError: if that cannot be written.
+    """
+    try:
+        RunDirectory(path).done.unlink(missing_ok=True)
+        _sync_folder(path)
+    except OSError as error:
+        raise _unwritable(RunDirectory(path).done, error) from error
+
+
+def _unwritable(file: Path, error: OSError) -> RunDirectoryError:
+    return RunDirectoryError(
+        f"{file} cannot be written: {error}. See that it is writable and the disk is not full."
+    )
 
 
 @contextlib.contextmanager
@@ -220,79 +226,6 @@ def _release_in_child() -> None:
 
 
 os.register_at_fork(after_in_child=_release_in_child)
-
-
-def metadata(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """What one needs to know to repeat a run that starts now, as plain JSON values.
-
-    Versions of race and of every installed distribution it needs, directly or not; Python, system
-    and processor; git commit of the source, if it is a checkout; devices; start time; command
-    line; and ``environment`` as it is.
-    """
-    return {
-        "started": datetime.now(UTC).isoformat(timespec="seconds"),
-        "command": sys.argv,
-        "environment": dict(environment),
-        "race": __version__,
-        "versions": _versions(),
-        "git": _git(Path(__file__).resolve().parent),
-        "python": platform.python_version(),
-        "platform": platform.platform(),
-        "processor": _processor(),
-        "processors": os.cpu_count(),
-        "backend": jax.default_backend(),
-        "devices": [device.device_kind for device in jax.devices()],
-    }
-
-
-def _versions() -> dict[str, str]:
-    found: dict[str, str] = {}
-    seen: set[tuple[str, frozenset[str]]] = set()
-    todo = [(DISTRIBUTION, frozenset({"cuda"}))]
-    while todo:
-        name, extras = todo.pop()
-        if (name, extras) in seen:
-            continue
-        seen.add((name, extras))
-        try:
-            distribution = importlib.metadata.distribution(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
-        found[name] = distribution.version
-        for line in distribution.requires or []:
-            requirement = _REQUIREMENT.match(line)
-            only_for = set(_EXTRA.findall(line))
-            if requirement and (not only_for or only_for & extras):
-                wanted = frozenset((requirement[2] or "").replace(" ", "").split(",")) - {""}
-                todo.append((requirement[1].lower().replace("_", "-"), wanted))
-    return dict(sorted(found.items()))
-
-
-def _git(source: Path) -> dict[str, Any] | None:
-    """Commit of the checkout that ``source`` belongs to; ``modified`` counts untracked files."""
-    # An installed package may lie in the checkout of another project, which does not track it.
-    if _output(source, "ls-files", "--error-unmatch", "__init__.py") is None:
-        return None
-    commit = _output(source, "rev-parse", "HEAD")
-    status = _output(source, "status", "--porcelain", "--", ".")
-    return None if commit is None else {"commit": commit, "modified": status != ""}
-
-
-def _output(folder: Path, *arguments: str) -> str | None:
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError, UnicodeDecodeError):
-        return None
-    return done.stdout.strip()
-
-
-def _processor() -> str:
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text(errors="replace").splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor()
 
 
 def _json(value: Any) -> str:

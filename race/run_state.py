@@ -154,7 +154,7 @@ def from_checkpoint(
     """
     progress = progress_of(saved)
     trained = learned_of(saved, config, spec, algorithm)
-    replay = _replay(saved, init_replay(spec, replay_rows(config, spec)))
+    replay = _replay(saved, config, spec)
     return RunState(trained["algorithm"], trained["losses"], replay, progress)
 
 
@@ -191,25 +191,29 @@ def progress_of(saved: Checkpoint) -> Progress:
     return Progress(**{**values, "fitness": tuple(values["fitness"])})
 
 
-def _replay(saved: Checkpoint, empty: Replay) -> Replay:
+def _replay(saved: Checkpoint, config: Config, spec: EnvSpec) -> Replay:
     if "replay" not in saved.rows:
         raise CheckpointError(f"The checkpoint {saved.path} holds no replay buffer.")
     rows = saved.rows["replay"]
-    if rows.inserted > rows.capacity != empty.capacity:
+    capacity = replay_rows(config, spec)
+    if rows.size > capacity or rows.inserted > rows.capacity != capacity:
         raise CheckpointError(
-            f"The checkpoint {saved.path} holds a full replay buffer of {rows.capacity} "
-            f"transitions, but the configuration asks for {empty.capacity}; a full buffer cannot "
-            "be resized. Restore learner.replay_capacity in config.json."
+            f"The checkpoint {saved.path} holds a replay buffer of {rows.capacity} transitions, "
+            f"which does not go into the {capacity} that config.json asks for. Put "
+            "learner.replay_capacity back to what the run began with."
         )
+    shapes = jax.eval_shape(lambda: init_replay(spec, capacity)).data
     columns = {}
-    for name, column in empty.data._asdict().items():
-        kept = np.asarray(rows.columns[name])[: rows.size] if name in rows.columns else None
+    for name, column in shapes._asdict().items():
+        kept = rows.columns.get(name)
         if kept is None or kept.shape[1:] != column.shape[1:] or kept.dtype != column.dtype:
             raise CheckpointError(
                 f"The checkpoint {saved.path} holds transitions of another task: its replay "
                 f"column {name} does not fit. Is config.json the one that the run began with?"
             )
-        whole = np.zeros(column.shape, column.dtype)
-        whole[: rows.size] = kept
-        columns[name] = jnp.array(whole)
+        if rows.capacity != capacity:
+            larger = np.zeros(column.shape, column.dtype)
+            larger[: rows.size] = kept[: rows.size]
+            kept = larger
+        columns[name] = jnp.array(kept)
     return Replay(Transition(**columns), jnp.asarray(rows.inserted, jnp.int32))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 from race import checkpoints, run_directory
 from race.algorithms import algorithm_of
 from race.algorithms.base import Teams
-from race.config import Config
+from race.config import Config, TeamName
 from race.envs import make_task
 from race.errors import ConfigError, RunDirectoryError
 from race.programs import act
 from race.run_directory import RunDirectory
 from race.run_state import Progress, learned_of, progress_of
 from race.types import Task
-
-TeamName = Literal["marl", "champion", "selected"]
 
 
 class Trained(NamedTuple):

@@ -1,4 +1,4 @@
-"""The training loop: generations of Algorithm 1, with metrics, evaluations and checkpoints.
+"""Training from the start or from a checkpoint, until the budget is used up.
 
 Everything that changes is one `RunState`; a generation maps it to the next. All randomness is
 drawn by purpose and counter from the run's seed, environments are reset with explicit seeds, and
@@ -6,85 +6,43 @@ gradient steps may be split over calls in any way. So a run that goes on from a 
 wherever it was written, does what the uninterrupted run does.
 """
 
-import math
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import PRNGKeyArray
-from numpy.typing import NDArray
-
-from race import checkpoints, programs, run_directory
-from race.algorithms import Algorithm, algorithm_of
+from race import checkpoints, run_directory
+from race.algorithms import algorithm_of
 from race.clock import Clock
 from race.config import Config
 from race.envs import make_task
-from race.errors import DivergenceError
-from race.evaluation import evaluate
+from race.errors import ConfigError, DivergenceError
+from race.generation import generation, warm_up
 from race.interrupts import Interrupts
 from race.metrics import MetricsWriter
-from race.records import evaluation_row, generation_row
-from race.replay import Replay
-from race.rollouts.host import EnvPool, collect
+from race.rollouts.host import EnvPool
+from race.run import Report, Run, save, silent
 from race.run_directory import RunDirectory
-from race.run_state import (
-    Progress,
-    Purpose,
-    RunState,
-    fresh,
-    from_checkpoint,
-    host_seeds,
-    n_teams,
-    root_key,
-    statics,
-    to_arrays,
-)
-from race.types import Rollout, Task, Transition
-
-CHUNK = 100
-"""Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
-
-Report = Callable[[str, Progress, dict[str, Any]], None]
-"""Told what is going on: the stage, the progress, and the newest row of metrics."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """What does not change during a run, and its resources."""
-
-    config: Config
-    task: Task
-    algorithm: Algorithm
-    directory: RunDirectory
-    pool: EnvPool  # one environment per acting team
-    test_pool: EnvPool
-    metrics: MetricsWriter
-    interrupts: Interrupts
-    report: Report
-    began: float  # time.perf_counter() when the process began
-
-    @property
-    def statics(self) -> dict[str, Any]:
-        """The static arguments of the compiled programs."""
-        return statics(self.config, self.task.spec, self.algorithm)
-
-
-def silent(stage: str, progress: Progress, row: dict[str, Any]) -> None:
-    """A report to nobody."""
+from race.run_state import Progress, RunState, fresh, from_checkpoint, n_teams
 
 
 def train(
-    path: Path, config: Config, *, report: Report = silent, began: float | None = None
+    path: Path,
+    config: Config,
+    *,
+    extend: bool = False,
+    report: Report = silent,
+    began: float | None = None,
 ) -> Progress:
     """Trains in ``path``: from the newest checkpoint if there is one, else from the start.
 
     ``path`` is a run directory made by `race.run_directory.create`. Returns how far it came:
     short of ``config.env_steps`` if it was interrupted, after saving a checkpoint.
+
+    Args:
+        path: the run directory.
+        config: its configuration, resolved.
+        extend: whether ``config.env_steps`` is a new budget, to be kept in the directory.
+        report: told what is going on.
+        began: `time.perf_counter` when the process began.
 
     Raises:
         RaceError: each with a message for the user; see the subclasses in `race.errors`.
@@ -99,7 +57,13 @@ def train(
             state = fresh(config, task.spec, algorithm)
         else:
             state = from_checkpoint(checkpoints.load(newest), config, task.spec, algorithm)
-        run_directory.clear_finished(path)
+        if not _must_go_on(path, config, extend, state.progress):
+            run_directory.mark_finished(path)
+            return state.progress
+        if extend:
+            # In this order a kill in between leaves a run that is merely unfinished.
+            run_directory.clear_finished(path)
+            run_directory.change_config(path, config)
         n_tests = config.evaluation.episodes * (2 if config.has_population else 1)
         processes = config.env.processes
         with (
@@ -124,9 +88,29 @@ def train(
                 progress = _train(run, state).progress
             except DivergenceError as error:
                 raise DivergenceError(f"{error} {_last_good(directory)}") from error
-        if progress.env_steps >= config.env_steps and not progress.learning:
+        if is_over(config, progress):
             run_directory.mark_finished(path)
     return progress
+
+
+def is_over(config: Config, progress: Progress) -> bool:
+    """Whether the budget is used up and the last generation complete."""
+    return progress.env_steps >= config.env_steps and not progress.learning
+
+
+def _must_go_on(path: Path, config: Config, extend: bool, progress: Progress) -> bool:
+    steps = f"The run in {path} has made {progress.env_steps:,} environment steps"
+    if extend and config.env_steps <= progress.env_steps:
+        raise ConfigError(
+            f"{steps}, so --env-steps {config.env_steps} would not extend it. Ask for more, or "
+            "leave --env-steps away to go on with what it began with."
+        )
+    if is_over(config, progress) and run_directory.is_finished(path):
+        raise ConfigError(
+            f"{steps} and has finished. To train it further, say up to how many steps: "
+            f"race resume {path} --env-steps {2 * config.env_steps}"
+        )
+    return not is_over(config, progress)
 
 
 def _last_good(directory: RunDirectory) -> str:
@@ -140,229 +124,13 @@ def _train(run: Run, state: RunState) -> RunState:
     clock = Clock(run.config.checkpoint.minutes)
     if state.progress.env_steps == 0:
         state = warm_up(run, state)
-        state = _save(run, clock.stamp(state))
-    while state.progress.learning or state.progress.env_steps < run.config.env_steps:
+        if run.interrupts.requested:
+            return state  # there is nothing yet that starting again would not bring back
+        state = save(run, clock.stamp(state))
+    while not is_over(run.config, state.progress):
         state = generation(run, state, clock)
         if run.interrupts.requested:
             break
         if clock.checkpoint_due():
-            state = _save(run, clock.stamp(state))
-    return _save(run, clock.stamp(state))
-
-
-def warm_up(run: Run, state: RunState) -> RunState:
-    """Random episodes before the first generation, exactly as many steps as asked for.
-
-    Raises:
-        DivergenceError: if the environment gives a reward that is not finite.
-    """
-    config, spec = run.config, run.task.spec
-    teams, collected, index = n_teams(config), 0, 0
-    replay = state.replay
-    while collected < config.learner.random_steps:
-        run.report("random steps", state.progress.but(env_steps=collected), {})
-        missing = config.learner.random_steps - collected
-        playing = min(teams, missing)
-        seeds = host_seeds(config, Purpose.WARM_UP, index, playing + 1)
-        generator = np.random.default_rng(int(seeds[-1]))
-        shape = (playing, spec.joint_action_size)
-
-        def choose(
-            _: NDArray[np.float32],
-            tick: int,
-            generator: np.random.Generator = generator,
-            shape: tuple[int, int] = shape,
-        ) -> NDArray[np.float32]:
-            return generator.uniform(-1, 1, shape).astype(np.float32)
-
-        rollout = collect(run.pool, choose, seeds[:-1], max_ticks=missing // playing)
-        _check_returns(rollout, "a random episode")
-        replay = store(replay, rollout.transitions)
-        collected += len(rollout.transitions.reward)
-        index += 1
-    progress = state.progress.but(env_steps=collected, random_steps=collected)
-    return state._replace(replay=replay, progress=progress)
-
-
-def generation(run: Run, state: RunState, clock: Clock) -> RunState:
-    """One pass of Algorithm 1, or the rest of one that a checkpoint broke off.
-
-    Comments name the lines of Algorithm 1. An interrupt leaves the gradient steps half done.
-    """
-    if not state.progress.learning:
-        clock.begin()
-        state, rollout = roll_out(run, state)  # 3-6
-        state = evolve(run, state, rollout)  # 9
-        state = clock.rolled_out(state)
-    while _owed(run, state) > 0:
-        state = learn(run, state)  # 8, 10, 13
-        if clock.checkpoint_due():
-            state = _save(run, clock.stamp(state))
-        if run.interrupts.requested:
-            return state
-    algorithm = run.algorithm.inject(state.algorithm)  # 11
-    state = state._replace(algorithm=algorithm, progress=state.progress.but(learning=False))
-    state = clock.stamp(state)
-    row = generation_row(run.config, run.algorithm, state)
-    run.metrics.write(row)
-    run.report("generation", state.progress, row)
-    state = state._replace(losses=programs.empty_losses(run.algorithm))
-    every, progress = run.config.evaluation.every, state.progress
-    if (
-        progress.env_steps // every > progress.evaluated_at // every
-        or progress.env_steps >= run.config.env_steps
-    ):
-        state = test(run, state)
-        state = clock.stamp(state)
-    return state
-
-
-def roll_out(run: Run, state: RunState) -> tuple[RunState, Rollout]:
-    """Lines 3 to 6: every team plays one episode; all steps go to the replay buffer.
-
-    Raises:
-        DivergenceError: if a fitness or an action is not a finite number.
-    """
-    config, progress = run.config, state.progress
-    run.report("rollouts", progress, {})
-    teams = run.algorithm.teams(state.algorithm)
-    seeds = host_seeds(config, Purpose.ROLLOUT, progress.generation, n_teams(config))
-    key = _key(run, Purpose.ROLLOUT, progress.generation)
-
-    def choose(states: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
-        action = programs.act(
-            teams,
-            states,
-            key,
-            np.int32(tick),
-            spec=run.task.spec,
-            base=config.base,
-            noise=config.learner.exploration_noise,
-        )
-        return np.asarray(action)
-
-    rollout = collect(run.pool, choose, seeds)
-    _check_returns(rollout, f"generation {progress.generation + 1}")
-    returns = rollout.episode_return.tolist()
-    progress = progress.but(
-        env_steps_before=progress.env_steps,
-        env_steps=progress.env_steps + len(rollout.transitions.reward),
-        gradient_steps_before=progress.gradient_steps,
-        generation=progress.generation + 1,
-        fitness=tuple(returns[:-1]),
-        marl_return=returns[-1],
-        learning=True,
-    )
-    replay = store(state.replay, rollout.transitions)
-    return state._replace(replay=replay, progress=progress), rollout
-
-
-def store(replay: Replay, transitions: Transition) -> Replay:
-    """Appends transitions of any number, in pieces of one size."""
-    size = min(programs.INSERT_ROWS, replay.capacity)
-    for first in range(0, len(transitions.reward), size):
-        piece = Transition(*(column[first : first + size] for column in transitions))
-        count = len(piece.reward)
-        padded = Transition(
-            *(np.pad(c, [(0, size - count), *[(0, 0)] * (c.ndim - 1)]) for c in piece)
-        )
-        replay = programs.store(replay, padded, np.int32(count))
-    return replay
-
-
-def evolve(run: Run, state: RunState, rollout: Rollout) -> RunState:
-    """Line 9: the population evolves by the fitness just measured."""
-    if not run.config.has_population:
-        return state
-    fitness = jnp.asarray(rollout.episode_return[:-1], jnp.float32)
-    key = _key(run, Purpose.EVOLUTION, state.progress.generation)
-    algorithm = programs.evolve(state.algorithm, fitness, key, **run.statics)
-    return state._replace(algorithm=algorithm)
-
-
-def learn(run: Run, state: RunState) -> RunState:
-    """Lines 8, 10 and 13: some of the gradient steps that the generation owes.
-
-    Raises:
-        DivergenceError: if a loss is not a finite number.
-    """
-    progress = state.progress
-    count = min(CHUNK, _owed(run, state))
-    algorithm, losses = programs.learn(
-        state.algorithm,
-        state.losses,
-        state.replay,
-        root_key(run.config, Purpose.LEARNING),
-        np.int32(progress.gradient_steps),
-        np.int32(count),
-        **run.statics,
-    )
-    for name, value in losses.items():
-        if not math.isfinite(float(value)):
-            raise DivergenceError(
-                f"The {name} loss is no longer a finite number, between gradient steps "
-                f"{progress.gradient_steps} and {progress.gradient_steps + count} of generation "
-                f"{progress.generation}. Start a new run with smaller learning rates "
-                "(--learner.actor-learning-rate, --learner.critic-learning-rate)."
-            )
-    if progress.gradient_steps == 0:
-        run.report(
-            "learning", progress, {"time/first_gradient_steps": time.perf_counter() - run.began}
-        )
-    progress = progress.but(gradient_steps=progress.gradient_steps + count)
-    run.report("learning", progress, {})
-    return state._replace(algorithm=algorithm, losses=losses, progress=progress)
-
-
-def _owed(run: Run, state: RunState) -> int:
-    progress = state.progress
-    learned_from = progress.env_steps - progress.random_steps
-    due = math.floor(learned_from * run.config.learner.gradient_steps_per_env_step)
-    return due - progress.gradient_steps
-
-
-def test(run: Run, state: RunState) -> RunState:
-    """Plays the test episodes and writes their row."""
-    config, progress = run.config, state.progress
-    run.report("evaluation", progress, {})
-    encoder, heads = run.algorithm.teams(state.algorithm)
-    played = {"marl": heads[-1]}
-    if config.has_population:
-        played["champion"] = run.algorithm.champion(state.algorithm)
-    seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, config.evaluation.episodes)
-    scores = evaluate(run.test_pool, encoder, played, seeds, run.task.spec, config.base)
-    row = evaluation_row(progress, scores)
-    progress = progress.but(evaluated_at=progress.env_steps)
-    run.metrics.write(row)
-    run.report("evaluation", progress, row)
-    return state._replace(progress=progress)
-
-
-def _check_returns(rollout: Rollout, where: str) -> None:
-    for team, value in enumerate(rollout.episode_return.tolist()):
-        if not math.isfinite(value):
-            raise DivergenceError(
-                f"The return of team {team} in {where} is {value}: the environment gave a reward "
-                "that is not a finite number. A fitness like that never wins, and a buffer that "
-                "holds it teaches nothing, so the run stops here. Look at the task's reward."
-            )
-
-
-def _key(run: Run, purpose: Purpose, index: int) -> PRNGKeyArray:
-    return jax.random.fold_in(root_key(run.config, purpose), index)
-
-
-def _save(run: Run, state: RunState) -> RunState:
-    run.metrics.sync()
-    progress = state.progress.but(metrics_offset=run.metrics.offset)
-    state = state._replace(progress=progress)
-    arrays, info, rows = to_arrays(state)
-    name = f"step-{progress.env_steps:012d}"
-    run.report("saving", progress, {})
-    checkpoints.save(
-        run.directory.checkpoints, name, arrays, info, rows, run.config.checkpoint.keep
-    )
-    return state
-
-
-__all__ = ["Report", "Run", "train"]
+            state = save(run, clock.stamp(state))
+    return save(run, clock.stamp(state))

@@ -50,7 +50,8 @@ def tiny_config() -> Callable[..., Any]:
     Targets are not smoothed and gradients not clipped, so that losses can be worked out; all
     teams enter the tournament, so that fates can be scripted.
     """
-    from race.config import Config, LearnerConfig, RaceConfig, resolve
+    from race.config import Config, LearnerConfig, RaceConfig
+    from race.presets import resolve
 
     def make(
         algo: str = "race",

@@ -1,16 +1,20 @@
 """The commands, with good and with bad input."""
 
+import dataclasses
 import json
 import os
 import re
 import shutil
+import signal
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from race import checkpoints, metrics
+from race import checkpoints, metrics, run_directory
 from race.cli import COMMANDS, main
+from race.cli.progress import TrainingDisplay
+from race.config import Config
 
 SMALL = (
     "--env-steps 120 --learner.random-steps 40 --learner.hidden-sizes 12 8 --learner.batch-size 8 "
@@ -101,7 +105,7 @@ def test_evaluate(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_resume_extends_a_finished_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "has finished" in fails(f"resume {run}", capsys)
-    assert "more than that" in fails(f"resume {run} --env-steps 100", capsys)
+    assert "would not extend" in fails(f"resume {run} --env-steps 100", capsys)
     before = metrics.read(run / "metrics.jsonl")
     race(f"resume {run} --env-steps 200")
     after = metrics.read(run / "metrics.jsonl")
@@ -109,6 +113,92 @@ def test_resume_extends_a_finished_run(run: Path, capsys: pytest.CaptureFixture[
     assert after[-1]["env_steps"] >= 200
     assert json.loads((run / "config.json").read_text())["env_steps"] == 200
     assert (run / "DONE").exists()
+
+
+def test_a_failed_extension_changes_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newest = checkpoints.newest(run / "checkpoints")
+    assert newest is not None
+    before = (run / "config.json").read_text()
+    (newest / "manifest.json").write_text("{}")
+    assert newest.name in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "config.json").read_text() == before
+    assert (run / "DONE").exists()
+    # The advice of the message works.
+    shutil.rmtree(newest)
+    race(f"resume {run} --env-steps 150")
+    assert json.loads((run / "config.json").read_text())["env_steps"] == 150
+    assert metrics.read(run / "metrics.jsonl")[-1]["env_steps"] >= 150
+
+
+def test_a_budget_below_what_was_done_is_refused(
+    trained: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "DONE").unlink()  # as if killed just before it was written
+    assert "would not extend" in fails(f"resume {run} --env-steps 50", capsys)
+    race(f"resume {run}")
+    assert (run / "DONE").exists()
+    assert (run / "metrics.jsonl").read_bytes() == (trained / "metrics.jsonl").read_bytes()
+
+
+def test_a_locked_run_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "config.json").read_text()
+    with run_directory.lock(run):
+        assert str(os.getpid()) in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "config.json").read_text() == before
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = tmp_path / "whole"
+    race(f"train probe/terminates --run-dir {whole} {SMALL}")
+    path = tmp_path / "run"
+    calls = 0
+    real = TrainingDisplay.report
+
+    def interrupted(self: TrainingDisplay, *news: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+        real(self, *news)
+
+    monkeypatch.setattr(TrainingDisplay, "report", interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        race(f"train probe/terminates --run-dir {path} {SMALL}")
+    assert stopped.value.code == 130
+    assert f"race resume {path}" in " ".join(capsys.readouterr().out.split())
+    assert not (path / "DONE").exists()
+    race(f"resume {path}")
+
+    def rows(of: Path) -> list[dict[str, Any]]:
+        timeless = re.compile("wall_seconds|time/.*")
+        found = metrics.read(of / "metrics.jsonl")
+        return [{k: v for k, v in row.items() if not timeless.match(k)} for row in found]
+
+    assert rows(path) == rows(whole)
+
+
+def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        race("train --help")
+    text = capsys.readouterr().out
+    groups = {
+        f.name: f.default_factory()
+        for f in dataclasses.fields(Config)  # type: ignore[misc]
+        if f.default_factory is not dataclasses.MISSING
+    }
+    for group, settings in groups.items():
+        for setting in dataclasses.fields(settings):
+            assert f"--{group}.{setting.name}".replace("_", "-") in text
+
+
+def test_observations_are_settings(tmp_path: Path) -> None:
+    sees = "--env.agent-obsk 1 --env.local-categories qpos,qvel qpos --env.global-categories qvel"
+    race(f"train mamujoco/Hopper-3x1 {sees} --run-dir {tmp_path / 'run'} {SMALL}")
+    saved = json.loads((tmp_path / "run" / "config.json").read_text())["env"]
+    assert saved["local_categories"] == [["qpos", "qvel"], ["qpos"]]
+    assert saved["global_categories"] == ["qvel"]
 
 
 def test_list(capsys: pytest.CaptureFixture[str]) -> None:
@@ -131,7 +221,8 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         ("train no_such_module:make", "no_such_module"),
         ("train probe/chain --race.population-size 1", "at least 4"),
         ("train probe/chain --learner.batch-size 64 --learner.replay-capacity 32", "no larger"),
-        ("train probe/chain --env-steps -5", "at least 1"),
+        ("train probe/chain --env-steps -5", "from 1"),
+        ("train probe/chain --env-steps 10000", "more than the random steps"),
         ("train probe/chain --learner.discount 1.5", "[0, 1)"),
         ("train probe/chain --learner.gradient-clip nan", "finite"),
         ("train probe/chain --race.vmm-weight nan", "finite"),

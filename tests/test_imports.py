@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 PACKAGE = Path(__file__).parent.parent / "race"
-GROUND = {"types", "config", "errors"}
+GROUND = {"types", "config", "errors", "checks", "presets"}
 MATHEMATICS = {"equations", "genetics", "networks", "critics", "optimization", "replay"}
 # Top-level name under `race` -> the names it may import from `race`, besides its own.
 ALLOWED = {

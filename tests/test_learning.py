@@ -13,14 +13,15 @@ import pytest
 
 from race import programs
 from race.algorithms import algorithm_of
-from race.config import Config, EnvConfig, LearnerConfig, RaceConfig, resolve
+from race.config import Config, EnvConfig, LearnerConfig, RaceConfig
 from race.critics import pevfa_values, q_values, state_values
 from race.envs import make_task
 from race.envs.probe import LAST, ChainEnv, TargetEnv
+from race.generation import store
+from race.presets import resolve
 from race.replay import init_replay
 from race.rollouts.host import EnvPool, collect
 from race.run_state import statics
-from race.trainer import store
 from race.types import Task, Transition
 
 DISCOUNT = 0.8

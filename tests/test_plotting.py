@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from race import config as configs
-from race.config import Config, resolve
+from race.config import Config, LearnerConfig
 from race.errors import RaceError, RunDirectoryError
 from race.plotting import Curve, aggregate, plot
+from race.presets import resolve
 
 
 def make_run(path: Path, points: list[tuple[int, float]], **settings: Any) -> Path:
@@ -85,6 +86,25 @@ def test_teams_and_other_quantities(tmp_path: Path) -> None:
     (rate,) = plot([run], out, metric="injection/elite_rate")
     assert rate.mean == pytest.approx(0.06)
     assert out.read_text().lstrip().startswith("<?xml")
+
+
+def test_runs_with_other_settings_are_other_curves(tmp_path: Path) -> None:
+    small = LearnerConfig(batch_size=32)
+    make_run(tmp_path / "a", [(100, 1.0), (200, 2.0)], algo="matd3", env_steps=20_000)
+    make_run(tmp_path / "b", [(100, 1.0), (200, 4.0)], algo="matd3", env_steps=30_000, seed=2)
+    make_run(tmp_path / "c", [(100, 1.0), (200, 8.0)], algo="matd3", learner=small)
+    found = {row.curve: (row.seeds, row.mean) for row in plot([tmp_path], tmp_path / "a.png")}
+    assert found == {
+        "MATD3 learner.batch_size=128": (2, 3.0),
+        "MATD3 learner.batch_size=32": (1, 8.0),
+    }
+
+
+def test_one_seed_does_not_count_twice(tmp_path: Path) -> None:
+    make_run(tmp_path / "a", [(100, 1.0)])
+    make_run(tmp_path / "b", [(100, 1.0)])
+    with pytest.raises(RaceError, match="same seed 1"):
+        plot([tmp_path], tmp_path / "a.png")
 
 
 def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:

@@ -10,9 +10,10 @@ from pathlib import Path
 import pytest
 
 import race
-from race import run_directory
+from race import metadata, run_directory
 from race.config import Config, LearnerConfig
 from race.errors import RunDirectoryError
+from race.presets import resolve
 from race.run_directory import (
     RunDirectory,
     clear_finished,
@@ -23,7 +24,7 @@ from race.run_directory import (
     open_run,
 )
 
-CONFIG = Config(task="mamujoco/Ant-2x4", seed=3, learner=LearnerConfig(discount=0.1 + 0.2))
+CONFIG = resolve(Config(task="mamujoco/Ant-2x4", seed=3, learner=LearnerConfig(discount=0.1 + 0.2)))
 
 
 @pytest.fixture
@@ -62,25 +63,25 @@ def test_the_commit_is_recorded_only_for_sources_that_the_checkout_tracks(tmp_pa
     source = tmp_path / "package"
     source.mkdir()
     (source / "__init__.py").write_text("")
-    assert run_directory._git(source) is None
+    assert metadata._git(source) is None
     git("init", "--quiet")
-    assert run_directory._git(source) is None
+    assert metadata._git(source) is None
     git("add", "package")
     git("commit", "--quiet", "-m", "first")
-    found = run_directory._git(source)
+    found = metadata._git(source)
     assert found is not None
     assert len(found["commit"]) == 40
     assert found["modified"] is False
     (source / "new.py").write_text("")
-    assert run_directory._git(source) == {**found, "modified": True}
+    assert metadata._git(source) == {**found, "modified": True}
 
 
 def test_metadata_needs_neither_git_nor_an_installed_distribution(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", "")
-    monkeypatch.setattr(run_directory, "DISTRIBUTION", "not-installed-anywhere")
-    data = run_directory.metadata({})
+    monkeypatch.setattr(metadata, "DISTRIBUTION", "not-installed-anywhere")
+    data = metadata.metadata({})
     assert data["git"] is None
     assert data["versions"] == {}
     assert data["race"] == race.__version__
@@ -269,3 +270,26 @@ def test_a_child_that_outlives_a_killed_process_does_not_keep_the_lock(tmp_path:
 def test_a_missing_directory_cannot_be_locked(tmp_path: Path) -> None:
     with pytest.raises(RunDirectoryError, match="cannot be locked"), lock(tmp_path / "missing"):
         pytest.fail("locked nothing")
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        ("learner", "batch_size", "8"),
+        ("learner", "batch_size", 8.5),
+        ("learner", "hidden_sizes", [400]),
+        ("learner", "discount", True),
+        ("race", "vmm_weight", "much"),
+        ("env", "local_categories", "qpos"),
+        ("evaluation", "episodes", 0),
+    ],
+)
+def test_a_config_with_a_wrong_value_is_refused(
+    path: Path, group: str, name: str, value: object
+) -> None:
+    create(path, CONFIG)
+    saved = json.loads((path / "config.json").read_text())
+    saved[group][name] = value
+    (path / "config.json").write_text(json.dumps(saved))
+    with pytest.raises(RunDirectoryError, match=name.replace("_", "[-_]")):
+        open_run(path)

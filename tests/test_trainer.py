@@ -14,17 +14,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from race import checkpoints, metrics, programs, run_directory, trainer
-from race.config import (
-    CheckpointConfig,
-    Config,
-    EvaluationConfig,
-    LearnerConfig,
-    RaceConfig,
-    resolve,
-)
+from race import checkpoints, generation, metrics, programs, run_directory, trainer
+from race.config import CheckpointConfig, Config, EvaluationConfig, LearnerConfig, RaceConfig
 from race.envs import factorised
 from race.errors import DivergenceError
+from race.presets import resolve
+from race.run import Report, silent
 from race.run_state import Progress
 from race.trainer import train
 from race.types import Task
@@ -55,7 +50,7 @@ def rows(path: Path) -> list[dict[str, Any]]:
     return [{k: v for k, v in row.items() if k not in TIMES} for row in found]
 
 
-def run(path: Path, config: Config, report: trainer.Report = trainer.silent) -> Progress:
+def run(path: Path, config: Config, report: Report = silent) -> Progress:
     if not (path / "config.json").exists():
         run_directory.create(path, config)
     return train(path, config, report=report)
@@ -63,7 +58,7 @@ def run(path: Path, config: Config, report: trainer.Report = trainer.silent) -> 
 
 @pytest.fixture(autouse=True)
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "CHUNK", 7)
+    monkeypatch.setattr(generation, "CHUNK", 7)
 
 
 @pytest.fixture(scope="module")
@@ -142,7 +137,7 @@ def test_a_run_stopped_early_and_extended_is_the_longer_run(
     short = small(env_steps=120)
     run(tmp_path, short)
     extended = dataclasses.replace(short, env_steps=220)
-    run(tmp_path, extended)
+    train(tmp_path, extended, extend=True)
     generations = [row for row in rows(tmp_path) if row["kind"] == "generation"]
     assert generations == [row for row in uninterrupted["race"] if row["kind"] == "generation"]
 
@@ -160,6 +155,40 @@ def test_gradient_steps_follow_the_ratio(tmp_path: Path) -> None:
     learner = dataclasses.replace(small().learner, gradient_steps_per_env_step=0.3)
     progress = run(tmp_path, small(learner=learner))
     assert progress.gradient_steps == int(0.3 * (progress.env_steps - progress.random_steps))
+
+
+class EndlessEnv(gymnasium.Env[Any, Any]):
+    """Never ends an episode."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict[str, Any]]:
+        return np.zeros(2), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        return np.zeros(2), 1.0, False, False, {}
+
+
+def test_the_episode_limit_holds_where_the_environment_has_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def make_task(name: str, config: Any) -> Task:
+        return factorised(
+            lambda mode: EndlessEnv(),
+            obs_index=((0,), (1,)),
+            action_index=((0,), (1,)),
+            task=name,
+            episode_limit=6,
+        )
+
+    monkeypatch.setattr(trainer, "make_task", make_task)
+    run(tmp_path, small("endless", algo="matd3", env_steps=52))
+    found = rows(tmp_path)
+    assert [row["env_steps"] for row in found if row["kind"] == "generation"] == [46, 52]
+    assert found[-1]["eval/marl/return_mean"] == 6.0
+    saved = checkpoints.load(checkpoints.newest(tmp_path / "checkpoints"))
+    assert not saved.rows["replay"].columns["terminated"].any()
 
 
 def test_each_program_is_compiled_once(tmp_path: Path) -> None:
@@ -247,8 +276,14 @@ def _command(path: Path, *extra: str) -> list[str]:
     ]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "number",
+    [
+        signal.SIGKILL,
+        pytest.param(signal.SIGINT, marks=pytest.mark.slow),
+        pytest.param(signal.SIGTERM, marks=pytest.mark.slow),
+    ],
+)
 def test_signals_lose_nothing(tmp_path: Path, number: signal.Signals) -> None:
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     whole = tmp_path / "whole"

@@ -22,6 +22,7 @@ from race.equations import (
     best_target,
     encoder_loss,
     marl_policy_loss,
+    mutual_information_bound,
     mutual_information_signal,
     state_value_loss,
     td_loss,
@@ -236,23 +237,22 @@ def _train_policies(
         team_action = learner.act(z, team, spec)
         q_marl = learner.q_marl(critic, batch.state, marl_action)[0]
         q_team = learner.q_team(pevfa, spec, batch.state, team_action, team)[0]
-        signal_of = jax.vmap(mutual_information_signal)
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
         # held fixed. Both products are the same numbers and are computed once.
         fixed_mine = jax.lax.stop_gradient(policies.mine)
-        signal = signal_of(mine_scores(fixed_mine, batch.state, z))
-        bound = signal_of(mine_scores(policies.mine, batch.state, jax.lax.stop_gradient(z)))
+        signal = jax.vmap(mutual_information_signal)(mine_scores(fixed_mine, batch.state, z))
+        fixed_z = jax.lax.stop_gradient(z)
+        bound = jax.vmap(mutual_information_bound)(mine_scores(policies.mine, batch.state, fixed_z))
         vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0))(weights, signal)
         vfm = value_function_maximization_loss(q_marl, q_team)
-        mine = -jnp.mean(bound, axis=1)
         # Agents share no encoder and no MINE, so sums over agents train each on its own terms.
         # W_marl enters through q_marl alone: its gradient is that of Eq. (7).
-        total = encoder_loss(vfm, jnp.sum(vmm), beta) + jnp.sum(mine)
+        total = encoder_loss(vfm, jnp.sum(vmm), beta) - jnp.sum(bound)
         losses = {
             "policy": marl_policy_loss(q_marl),
             "vfm": vfm,
             "vmm": jnp.mean(vmm),
-            "mine": jnp.mean(mine),
+            "mine": -jnp.mean(bound),
         }
         return total, losses
 

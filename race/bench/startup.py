@@ -51,7 +51,8 @@ def _train_until_first_steps(path: Path) -> None:
     # What `race train mamujoco/HalfCheetah-2x3 --run-dir DIR` does, with another report.
     from race import run_directory
     from race.cli.compilation import use_cache
-    from race.config import Config, resolve
+    from race.config import Config
+    from race.presets import resolve
     from race.trainer import train
 
     def report(stage: str, progress: Any, row: dict[str, Any]) -> None:

@@ -13,8 +13,9 @@ from race import run_directory
 from race.bench.measurement import Measurement, Subject
 from race.bench.update import setting
 from race.config import Algo
+from race.generation import CHUNK
 from race.run_state import Progress, n_teams
-from race.trainer import CHUNK, train
+from race.trainer import train
 
 GOAL = 0.10
 GENERATIONS = 2
@@ -38,7 +39,7 @@ class _EnoughError(Exception):
 
 
 class _Stopwatch:
-    """A `race.trainer.Report` that notes when gradient steps were done."""
+    """A `race.run.Report` that notes when gradient steps were done."""
 
     def __init__(self) -> None:
         self._generations: list[list[float]] = []  # when each 100 steps of them were done

@@ -4,10 +4,11 @@ import json
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from race.config import TeamName
 from race.errors import ConfigError
 
 BATCH = 20
@@ -23,7 +24,7 @@ class Evaluate:
 
     run_dir: Annotated[Path, tyro.conf.Positional]
     """The run's directory."""
-    team: Literal["marl", "champion", "selected"] = "selected"
+    team: TeamName = "selected"
     """The gradient learner's team, the population's team of best training fitness, or of these
     two the one with the better training return."""
     episodes: int = 10

@@ -7,7 +7,8 @@ from typing import get_args
 
 import tyro
 
-from race.config import PRESETS, TABLE_3, Algo
+from race.config import Algo
+from race.presets import PRESETS, TABLE_3
 
 ALGORITHMS = {
     "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "

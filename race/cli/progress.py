@@ -49,7 +49,7 @@ class TrainingDisplay:
         self._bar.stop()
 
     def report(self, stage: str, progress: Progress, row: dict[str, Any]) -> None:
-        """A `race.trainer.Report`."""
+        """A `race.run.Report`."""
         if progress.gradient_steps == 0 and stage == "learning" and not row:
             stage = "compiling"
         covered = _covered(progress)

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 
+from race.config import TeamName
 from race.errors import ConfigError, RenderError
 
 
@@ -17,7 +18,7 @@ class Render:
     """The run's directory."""
     out: Path = Path("team.mp4")
     """The video: .mp4 or .gif."""
-    team: Literal["marl", "champion", "selected"] = "selected"
+    team: TeamName = "selected"
     """The gradient learner's team, the population's team of best training fitness, or of these
     two the one with the better training return."""
     seed: int = 0

@@ -7,8 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from race.config import resolve
-from race.errors import ConfigError
+from race.presets import resolve
 
 
 @dataclass(frozen=True)
@@ -31,19 +30,7 @@ def main(arguments: list[str]) -> None:
     from race import run_directory
     from race.cli.training import run
 
-    path = chosen.run_dir
-    config = run_directory.open_run(path)
+    config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
-        if run_directory.is_finished(path) and chosen.env_steps <= config.env_steps:
-            raise ConfigError(
-                f"The run in {path} has finished its {config.env_steps:,} environment steps; to "
-                f"extend it, ask for more than that with --env-steps."
-            )
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))
-        run_directory.change_config(path, config)
-    elif run_directory.is_finished(path):
-        raise ConfigError(
-            f"The run in {path} has finished. To train it further, say up to how many steps: "
-            f"race resume {path} --env-steps {2 * config.env_steps}"
-        )
-    run(path, config)
+    run(chosen.run_dir, config, extend=chosen.env_steps is not None)

@@ -8,7 +8,6 @@ from typing import Annotated
 import tyro
 
 from race.config import (
-    PRESETS,
     Algo,
     Base,
     CheckpointConfig,
@@ -18,8 +17,8 @@ from race.config import (
     LearnerConfig,
     Preset,
     RaceConfig,
-    resolve,
 )
+from race.presets import PRESETS, resolve
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from race.cli import seconds_since_start
 from race.cli.compilation import use_cache
 from race.cli.progress import TrainingDisplay
 from race.config import Config
-from race.trainer import train
+from race.trainer import is_over, train
 from race.types import Task
 
 
@@ -29,7 +29,7 @@ def describe(task: Task) -> dict[str, Any]:
     }
 
 
-def run(path: Path, config: Config) -> None:
+def run(path: Path, config: Config, *, extend: bool = False) -> None:
     """Trains in an existing run directory and says how it ended. Exits with 130 on Ctrl-C."""
     import time
 
@@ -42,8 +42,8 @@ def run(path: Path, config: Config) -> None:
     )
     began = time.perf_counter() - seconds_since_start()
     with TrainingDisplay(config, console) as display:
-        progress = train(path, config, report=display.report, began=began)
-    if progress.env_steps < config.env_steps or progress.learning:
+        progress = train(path, config, extend=extend, report=display.report, began=began)
+    if not is_over(config, progress):
         console.print(
             f"Interrupted and saved at {progress.env_steps:,} environment steps. "
             f"Go on with: race resume {path}",

@@ -125,7 +125,12 @@ def _own_task(task_id: str, config: EnvConfig) -> Task:
             f"Task {task_id}: {module_name} ({module.__file__}) has no function {function_name}. "
             "Define one that returns a race.types.Task, for example with race.envs.factorised."
         )
-    task = function(config) if inspect.signature(function).parameters else function()
+    required = any(
+        parameter.default is parameter.empty
+        and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
+        for parameter in inspect.signature(function).parameters.values()
+    )
+    task = function(config) if required else function()
     if not isinstance(task, Task):
         raise TaskError(
             f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "

@@ -119,7 +119,8 @@ class EnvPool:
         team: int | None = None
         try:
             if self._workers is not None:
-                everyone = np.zeros((self.size, actions.shape[1]), np.float32)
+                everyone = np.empty((self.size, actions.shape[1]), np.float32)
+                everyone[:] = (np.array(self.spec.action_low) + self.spec.action_high) / 2
                 everyone[alive] = actions[alive]
                 states, *outcome, _ = self._workers.step(everyone)
                 next_states[:] = states[alive]
@@ -173,7 +174,8 @@ def collect(
             returns their joint actions [T, U] between -1 and 1, which are clipped to it. Rows of
             teams whose episode has ended are ignored; their states stay as they were at the end.
         seeds: for each team, the seed of its environment's reset, [T].
-        max_ticks: steps after which running episodes are cut (not terminated).
+        max_ticks: steps after which running episodes are cut (not terminated), if that is before
+            the task's own limit.
 
     Returns:
         Transitions in order of tick, then team; actions as `act` gave them, clipped. Rewards and
@@ -193,7 +195,8 @@ def collect(
     count = tick = 0
     states = pool.reset(seeds)
     alive = np.arange(teams)
-    while alive.size and (max_ticks is None or tick < max_ticks):
+    limit = spec.episode_limit if max_ticks is None else min(max_ticks, spec.episode_limit)
+    while alive.size and tick < limit:
         actions = np.asarray(act(states, tick), np.float32)
         if actions.shape != (teams, spec.joint_action_size):
             raise ValueError(
@@ -214,7 +217,7 @@ def collect(
         next_states = np.empty((alive.size, spec.state_size), np.float32)
         rewards = np.empty(alive.size, np.float64)
         terminated, truncated = np.empty((2, alive.size), np.bool_)
-        pool.step(alive, _in_units(actions, low, high), next_states, rewards, terminated, truncated)
+        pool.step(alive, in_units(actions, low, high), next_states, rewards, terminated, truncated)
         rows.state[here] = states[alive]
         rows.action[here] = actions[alive]
         rows.reward[here] = rewards
@@ -231,7 +234,7 @@ def collect(
     return Rollout(Transition(*(array[:count] for array in rows)), episode_return, episode_length)
 
 
-def _in_units(
+def in_units(
     actions: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]
 ) -> NDArray[np.float32]:
     """Actions between -1 and 1 to the environment's units, in float32; [..., U] -> [..., U].

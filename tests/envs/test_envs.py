@@ -6,9 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 
-from race.config import TABLE_3, EnvConfig
+from race.config import EnvConfig
 from race.envs import describe_tasks, factorised, make_task, task_ids
 from race.errors import TaskError
+from race.presets import TABLE_3
 from race.rollouts.host import EnvPool, collect
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "environments.md"

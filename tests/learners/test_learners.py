@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from race.config import Config, LearnerConfig, resolve
+from race.config import Config, LearnerConfig
 from race.learners import LEARNERS, matd3
+from race.presets import resolve
 from race.types import EnvSpec
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from race.envs import factorised, make_task
 from race.errors import DivergenceError
-from race.rollouts.host import EnvPool, _in_units, collect
+from race.rollouts.host import EnvPool, collect, in_units
 
 
 class Countdown(gymnasium.Env):
@@ -147,7 +147,7 @@ def test_units_are_exact_products_around_zero_and_stay_inside_elsewhere():
     rng = np.random.default_rng(0)
     actions = np.concatenate([rng.uniform(-1, 1, (1000, 2)), [[1, 1], [-1, -1]]]).astype(np.float32)
     low, high = np.float32([-0.4, 0.1]), np.float32([0.4, 0.7])
-    units = _in_units(actions, low, high)
+    units = in_units(actions, low, high)
     assert units.dtype == np.float32
     np.testing.assert_array_equal(units[:, 0], actions[:, 0] * np.float32(0.4))
     assert (units >= low).all()

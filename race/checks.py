@@ -1,0 +1,143 @@
+"""What values of a configuration can work."""
+
+import math
+from typing import Any
+
+from race.config import Config
+from race.errors import ConfigError
+
+
+def check(config: Config) -> None:
+    """Checks every value of a configuration whose presets are filled in.
+
+    Raises:
+        ConfigError: naming the first setting that cannot work, and what would.
+    """
+    learner, race = config.learner, config.race
+    assert race.mutation_fraction is not None
+    assert race.vmm_weight is not None
+    rules: list[tuple[bool, str, Any, str]] = [
+        (1 <= config.env_steps < 2**31, "env-steps", config.env_steps, "from 1 to 2147483647"),
+        (
+            config.env_steps > learner.random_steps,
+            "env-steps",
+            config.env_steps,
+            f"more than the random steps before training (learner.random-steps "
+            f"{learner.random_steps})",
+        ),
+        (0 <= config.seed < 2**31, "seed", config.seed, "from 0 to 2147483647"),
+        (min(learner.hidden_sizes) >= 1, "learner.hidden-sizes", learner.hidden_sizes, "positive"),
+        (learner.batch_size >= 2, "learner.batch-size", learner.batch_size, "at least 2"),
+        (
+            learner.batch_size <= learner.replay_capacity,
+            "learner.batch-size",
+            learner.batch_size,
+            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
+        ),
+        (
+            max(learner.random_steps, 1) <= learner.replay_capacity,
+            "learner.random-steps",
+            learner.random_steps,
+            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
+        ),
+        (learner.random_steps >= 0, "learner.random-steps", learner.random_steps, "0 or more"),
+        (
+            learner.actor_learning_rate > 0,
+            "learner.actor-learning-rate",
+            learner.actor_learning_rate,
+            "above 0",
+        ),
+        (
+            learner.critic_learning_rate > 0,
+            "learner.critic-learning-rate",
+            learner.critic_learning_rate,
+            "above 0",
+        ),
+        (learner.gradient_clip > 0, "learner.gradient-clip", learner.gradient_clip, "above 0"),
+        (0 <= learner.discount < 1, "learner.discount", learner.discount, "in [0, 1)"),
+        (
+            0 < learner.target_update_rate <= 1,
+            "learner.target-update-rate",
+            learner.target_update_rate,
+            "in (0, 1]",
+        ),
+        (learner.policy_delay >= 1, "learner.policy-delay", learner.policy_delay, "at least 1"),
+        (
+            learner.exploration_noise >= 0,
+            "learner.exploration-noise",
+            learner.exploration_noise,
+            "0 or more",
+        ),
+        (
+            learner.smoothing_noise >= 0,
+            "learner.smoothing-noise",
+            learner.smoothing_noise,
+            "0 or more",
+        ),
+        (
+            learner.smoothing_clip >= 0,
+            "learner.smoothing-clip",
+            learner.smoothing_clip,
+            "0 or more",
+        ),
+        (
+            0 < learner.gradient_steps_per_env_step <= 100,
+            "learner.gradient-steps-per-env-step",
+            learner.gradient_steps_per_env_step,
+            "in (0, 100]",
+        ),
+        (
+            race.population_size >= 4,
+            "race.population-size",
+            race.population_size,
+            "at least 4: an elite, a second parent, a team for their offspring and one for the "
+            "injected MARL team (for no population use --algo matd3)",
+        ),
+        (
+            0 <= race.mutation_fraction <= 1,
+            "race.mutation-fraction",
+            race.mutation_fraction,
+            "in [0, 1]",
+        ),
+        (race.vmm_weight >= 0, "race.vmm-weight", race.vmm_weight, "0 or more"),
+        (
+            0 <= race.mutation_probability <= 1,
+            "race.mutation-probability",
+            race.mutation_probability,
+            "in [0, 1]",
+        ),
+        (
+            0 <= race.agent_mutation_probability <= 1,
+            "race.agent-mutation-probability",
+            race.agent_mutation_probability,
+            "in [0, 1]",
+        ),
+        (race.tournament_size >= 1, "race.tournament-size", race.tournament_size, "at least 1"),
+        (
+            race.policy_embedding_size >= 1,
+            "race.policy-embedding-size",
+            race.policy_embedding_size,
+            "at least 1",
+        ),
+        (race.mine_size >= 1, "race.mine-size", race.mine_size, "at least 1"),
+        (config.env.agent_obsk >= 0, "env.agent-obsk", config.env.agent_obsk, "0 or more"),
+        (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
+        (
+            config.evaluation.episodes >= 1,
+            "evaluation.episodes",
+            config.evaluation.episodes,
+            "at least 1",
+        ),
+        (
+            config.checkpoint.minutes >= 0,
+            "checkpoint.minutes",
+            config.checkpoint.minutes,
+            "0 or more",
+        ),
+        (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
+    ]
+    for holds, name, value, must in rules:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
+        if not holds:
+            raise ConfigError(f"--{name} is {value}, but it must be {must}.")

@@ -1,0 +1,69 @@
+"""A run in progress: its fixed parts and resources, and how its state gets to disk."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from race import checkpoints, programs
+from race.algorithms import Algorithm
+from race.config import Config
+from race.errors import DivergenceError
+from race.interrupts import Interrupts
+from race.metrics import MetricsWriter
+from race.rollouts.host import EnvPool
+from race.run_directory import RunDirectory
+from race.run_state import Progress, RunState, statics, to_arrays
+from race.types import Task
+
+Report = Callable[[str, Progress, dict[str, Any]], None]
+"""Told what is going on: the stage, the progress, and the newest row of metrics."""
+
+
+def silent(stage: str, progress: Progress, row: dict[str, Any]) -> None:
+    """A report to nobody."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What does not change during a run, and its resources."""
+
+    config: Config
+    task: Task
+    algorithm: Algorithm
+    directory: RunDirectory
+    pool: EnvPool  # one environment per acting team
+    test_pool: EnvPool
+    metrics: MetricsWriter
+    interrupts: Interrupts
+    report: Report
+    began: float  # time.perf_counter() when the process began
+
+    @property
+    def statics(self) -> dict[str, Any]:
+        """The static arguments of the compiled programs."""
+        return statics(self.config, self.task.spec, self.algorithm)
+
+
+def save(run: Run, state: RunState) -> RunState:
+    """Writes a checkpoint; returns the state with the metrics' length in it.
+
+    Raises:
+        DivergenceError: if a number of the algorithm's state is not finite.
+        CheckpointError: if it cannot be written.
+    """
+    if not programs.all_finite(state.algorithm):
+        raise DivergenceError(
+            "A network's parameters are no longer finite numbers, though its last loss was. Start "
+            "a new run with smaller learning rates (--learner.actor-learning-rate, "
+            "--learner.critic-learning-rate)."
+        )
+    run.metrics.sync()
+    progress = state.progress.but(metrics_offset=run.metrics.offset)
+    state = state._replace(progress=progress)
+    arrays, info, rows = to_arrays(state)
+    name = f"step-{progress.env_steps:012d}"
+    run.report("saving", progress, {})
+    checkpoints.save(
+        run.directory.checkpoints, name, arrays, info, rows, run.config.checkpoint.keep
+    )
+    return state
