@@ -6,7 +6,7 @@ BIN := .venv/bin
 
 demo: .venv/installed
 	@rm -rf demo
-	$(BIN)/race train mamujoco/HalfCheetah-2x3 --preset demo --env-steps 60000 --run-dir demo
+	$(BIN)/race train mamujoco/HalfCheetah-2x3 --preset demo --env-steps 80000 --run-dir demo
 	$(BIN)/race plot demo --team all --out demo/curve.png
 	$(BIN)/race render demo --out demo/team.mp4
 	@echo "The learning curve is in demo/curve.png and the video of the trained team in demo/team.mp4"
