@@ -82,8 +82,12 @@ def plot(
     _refuse_twins(runs)
     names = _names([config for _, config in runs])
     curves: dict[str, dict[tuple[str, str], list[Curve]]] = {}
-    for (path, config), method in zip(runs, names, strict=True):
-        rows = metrics.read(RunDirectory(path).metrics)
+    read = [metrics.read(RunDirectory(path).metrics) for path, _ in runs]
+    keys_of = {True: set[str](), False: set[str]()}
+    for (_, config), rows in zip(runs, read, strict=True):
+        keys_of[config.has_population] |= {key for row in rows for key in row}
+    of_populations = keys_of[True] - keys_of[False]
+    for (path, config), method, rows in zip(runs, names, read, strict=True):
         if not rows:
             raise RunDirectoryError(
                 f"The run in {path} has no rows of metrics yet: wait until its first generation "
@@ -91,6 +95,8 @@ def plot(
             )
         for label, key in _keys(metric, team, config).items():
             name = f"{method}, {label}" if label else method
+            if not config.has_population and key in of_populations:
+                continue  # a quantity of populations, asked for of several methods
             curve = _curve(path, rows, key, metric)
             curves.setdefault(config.task, {}).setdefault((method, name), []).append(curve)
     figure = Figure(figsize=(6.4 * min(len(curves), 3), 4.4 * math.ceil(len(curves) / 3)))

@@ -85,6 +85,11 @@ def test_teams_and_other_quantities(tmp_path: Path) -> None:
     }
     (rate,) = plot([run], out, metric="injection/elite_rate")
     assert rate.mean == pytest.approx(0.06)
+    # Asked for of several methods, a quantity of populations is drawn for those that have one.
+    other = make_run(tmp_path / "other", [(100, 50.0), (200, 60.0)], algo="matd3")
+    rows = (other / "metrics.jsonl").read_text().replace("injection/elite_rate", "marl/return")
+    (other / "metrics.jsonl").write_text(rows)
+    assert len(plot([run, other], out, metric="injection/elite_rate")) == 1
     assert out.read_text().lstrip().startswith("<?xml")
 
 
