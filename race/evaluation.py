@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -53,10 +52,9 @@ def evaluate(
     n = len(seeds)
     stacked = jnp.repeat(jnp.stack(list(heads.values())), n, axis=0)
     teams = Teams(encoder, stacked)
-    key, tick = jax.random.key(0), jnp.zeros((), jnp.int32)  # no noise: neither is used
 
     def choose(states: NDArray[np.float32], _: int) -> NDArray[np.float32]:
-        return np.asarray(act(teams, states, key, tick, spec=spec, base=base, noise=0.0))
+        return np.asarray(act(teams, states, spec=spec, base=base))
 
     rollout = collect(pool, choose, np.tile(seeds, len(heads)))
     return {

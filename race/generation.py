@@ -107,22 +107,17 @@ def roll_out(run: Run, state: RunState) -> tuple[RunState, Rollout]:
     config, progress = run.config, state.progress
     run.report("rollouts", progress, {})
     teams = run.algorithm.teams(state.algorithm)
-    seeds = host_seeds(config, Purpose.ROLLOUT, progress.generation, n_teams(config))
-    key = _key(run, Purpose.ROLLOUT, progress.generation)
+    seeds = host_seeds(config, Purpose.ROLLOUT, progress.generation, n_teams(config) + 1)
+    noise = np.random.default_rng(int(seeds[-1]))
+    shape, scale = run.task.spec.joint_action_size, np.float32(config.learner.exploration_noise)
 
-    def choose(states: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
-        action = programs.act(
-            teams,
-            states,
-            key,
-            np.int32(tick),
-            spec=run.task.spec,
-            base=config.base,
-            noise=config.learner.exploration_noise,
-        )
-        return np.asarray(action)
+    def choose(states: NDArray[np.float32], _: int) -> NDArray[np.float32]:
+        actions = np.array(programs.act(teams, states, spec=run.task.spec, base=config.base))
+        # The last team, the MARL team, explores; the population explores by its diversity.
+        actions[-1] += scale * noise.standard_normal(shape, np.float32)
+        return actions
 
-    rollout = collect(run.pool, choose, seeds)
+    rollout = collect(run.pool, choose, seeds[:-1])
     _check_returns(rollout, f"generation {progress.generation + 1}")
     returns = rollout.episode_return.tolist()
     progress = progress.but(

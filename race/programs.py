@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms import Algorithm
@@ -88,29 +89,13 @@ def store(replay: Replay, rows: Transition, count: Int[Array, ""]) -> Replay:
     return insert(replay, rows, count)
 
 
-@partial(jax.jit, static_argnames=("spec", "base", "noise"))
+@partial(jax.jit, static_argnames=("spec", "base"))
 def act(
-    teams: Teams,
-    state: Float[Array, "T S"],
-    key: PRNGKeyArray,
-    tick: Int[Array, ""],
-    *,
-    spec: EnvSpec,
-    base: str,
-    noise: float,
+    teams: Teams, state: Float[Array, "T S"] | Float[np.ndarray, "T S"], *, spec: EnvSpec, base: str
 ) -> Float[Array, "T U"]:
-    """The joint actions of all teams, each in its own state: one batched call per tick.
-
-    With ``noise`` the last team, the MARL team, explores with Gaussian noise of that standard
-    deviation; the population explores by its diversity. Without, ``key`` is not used.
-    """
-    TRACES[f"act, noise {noise}"] += 1
-    z = LEARNERS[base].encode(teams.encoder, spec, state)
-    action = act_teams(z, teams.heads, spec)
-    if noise == 0:
-        return action
-    exploration = noise * jax.random.normal(jax.random.fold_in(key, tick), action.shape[1:])
-    return action.at[-1].set(jnp.clip(action[-1] + exploration, -1.0, 1.0))
+    """The joint actions of all teams, each in its own state: one batched call per tick."""
+    TRACES["act"] += 1
+    return act_teams(LEARNERS[base].encode(teams.encoder, spec, state), teams.heads, spec)
 
 
 @partial(jax.jit, static_argnames=("algorithm", "spec", "config"))

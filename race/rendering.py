@@ -197,6 +197,8 @@ def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     model.vis.global_.fovy = sketch.focus(model, data).field_of_view
+    # A plane collides everywhere but is drawn as large as its size says; 0 stands for endless.
+    model.geom_size[model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE), :2] = 0.0
 
     def scene() -> NDArray[np.uint8]:
         seen = sketch.focus(model, data)

@@ -4,8 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import NDArray
@@ -48,12 +46,10 @@ class Trained(NamedTuple):
     def policy(self, team: TeamName) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
         """The team as a function from a state [S] to a joint action [U] in [-1, 1]."""
         teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
-        key, tick = jax.random.key(0), jnp.zeros((), jnp.int32)  # no noise: neither is used
         spec, base = self.task.spec, self.config.base
 
         def choose(state: NDArray[np.float32]) -> NDArray[np.float32]:
-            action = act(teams, state[None], key, tick, spec=spec, base=base, noise=0.0)
-            return np.asarray(action)[0]
+            return np.asarray(act(teams, state[None], spec=spec, base=base))[0]
 
         return choose
 

@@ -151,6 +151,19 @@ def test_random_steps_count_and_are_exact(tmp_path: Path) -> None:
     assert saved.rows["replay"].inserted == progress.env_steps
 
 
+def test_only_the_marl_team_explores_with_noise(tmp_path: Path) -> None:
+    found = []
+    for noise in (0.0, 0.5):
+        learner = dataclasses.replace(small().learner, exploration_noise=noise)
+        path = tmp_path / str(noise)
+        run(path, small("probe/chain", learner=learner, env_steps=46))
+        found.append(rows(path)[0])
+    quiet, noisy = found
+    for key in ("population/fitness_max", "population/fitness_mean", "population/fitness_min"):
+        assert quiet[key] == noisy[key]
+    assert quiet["marl/return"] != noisy["marl/return"]
+
+
 def test_gradient_steps_follow_the_ratio(tmp_path: Path) -> None:
     learner = dataclasses.replace(small().learner, gradient_steps_per_env_step=0.3)
     progress = run(tmp_path, small(learner=learner))
@@ -200,8 +213,7 @@ def test_each_program_is_compiled_once(tmp_path: Path) -> None:
     assert counts == {
         "start": 1,
         "store": 1,
-        "act, noise 0.1": 1,
-        "act, noise 0.0": 1,
+        "act": 2,  # training, and evaluation with its own number of teams
         "evolve": 1,
         "learn": 1,
     }
