@@ -38,7 +38,7 @@ def files_of(part: str) -> list[Path]:
     return sorted(path.rglob("*.py")) if path.is_dir() else [path.with_suffix(".py")]
 
 
-@pytest.mark.parametrize("part", ALLOWED)
+@pytest.mark.parametrize("part", sorted(ALLOWED))
 def test_imports_go_one_way(part: str) -> None:
     for path in files_of(part):
         wrong = imported(path.read_text()) - ALLOWED[part] - {part}
