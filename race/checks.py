@@ -6,6 +6,11 @@ from typing import Any
 from race.config import Config
 from race.errors import ConfigError
 
+LARGEST_LAYER = 16_384
+"""Units of a layer, samples of a batch, teams: more is a slip of the hand."""
+MOST_TRANSITIONS = 2**30
+"""Transitions in a replay buffer, which counts them with 32 bits."""
+
 
 def check(config: Config) -> None:
     """Checks every value of a configuration whose presets are filled in.
@@ -28,6 +33,23 @@ def check(config: Config) -> None:
         (0 <= config.seed < 2**31, "seed", config.seed, "from 0 to 2147483647"),
         (min(learner.hidden_sizes) >= 1, "learner.hidden-sizes", learner.hidden_sizes, "positive"),
         (learner.batch_size >= 2, "learner.batch-size", learner.batch_size, "at least 2"),
+        (
+            learner.replay_capacity <= MOST_TRANSITIONS,
+            "learner.replay-capacity",
+            learner.replay_capacity,
+            f"at most {MOST_TRANSITIONS}",
+        ),
+        *(
+            (size <= LARGEST_LAYER, f"{name}", size, f"at most {LARGEST_LAYER}")
+            for name, size in (
+                ("learner.hidden-sizes", max(learner.hidden_sizes)),
+                ("learner.batch-size", learner.batch_size),
+                ("race.policy-embedding-size", race.policy_embedding_size),
+                ("race.mine-size", race.mine_size),
+                ("race.population-size", race.population_size),
+                ("evaluation.episodes", config.evaluation.episodes),
+            )
+        ),
         (
             learner.batch_size <= learner.replay_capacity,
             "learner.batch-size",

@@ -33,7 +33,7 @@ def warm_up(run: Run, state: RunState) -> RunState:
     If it is interrupted, the state stays as it was.
 
     Raises:
-        DivergenceError: if the environment gives a reward that is not finite.
+        DivergenceError: if the environment gives a reward or a state that is not finite.
     """
     config, spec = run.config, run.task.spec
     teams, collected, index = n_teams(config), 0, 0
@@ -57,7 +57,7 @@ def warm_up(run: Run, state: RunState) -> RunState:
             return generator.uniform(-1, 1, shape).astype(np.float32)
 
         rollout = collect(run.pool, choose, seeds[:-1], max_ticks=missing // playing)
-        _check_returns(rollout, "a random episode")
+        _check_finite(rollout, "the random episodes")
         replay = store(replay, rollout.transitions)
         collected += len(rollout.transitions.reward)
         index += 1
@@ -118,7 +118,7 @@ def roll_out(run: Run, state: RunState) -> tuple[RunState, Rollout]:
         return actions
 
     rollout = collect(run.pool, choose, seeds[:-1])
-    _check_returns(rollout, f"generation {progress.generation + 1}")
+    _check_finite(rollout, f"generation {progress.generation + 1}")
     returns = rollout.episode_return.tolist()
     progress = progress.but(
         env_steps_before=progress.env_steps,
@@ -214,7 +214,12 @@ def test(run: Run, state: RunState) -> RunState:
     return state._replace(progress=progress)
 
 
-def _check_returns(rollout: Rollout, where: str) -> None:
+def _check_finite(rollout: Rollout, where: str) -> None:
+    if not np.isfinite(rollout.transitions.next_state).all():
+        raise DivergenceError(
+            f"The environment gave a state that is not a finite number in {where}. A buffer that "
+            "holds it teaches nothing, so the run stops here. Look at the task's observation."
+        )
     for team, value in enumerate(rollout.episode_return.tolist()):
         if not math.isfinite(value):
             raise DivergenceError(

@@ -213,8 +213,9 @@ def _curve(path: Path, rows: list[dict[str, object]], key: str, metric: str) -> 
         short = {k.removeprefix("eval/selected/") for k in known}
         near = difflib.get_close_matches(metric, sorted(known | short), n=3, cutoff=0.3)
         raise RaceError(
-            f"The run in {path} has no values of {metric!r}. Nearest: {', '.join(near)}. "
-            f"All: {', '.join(sorted(known))}."
+            f"The run in {path} has no values of {metric!r}. "
+            + (f"Nearest: {', '.join(near)}. " if near else "")
+            + f"All: {', '.join(sorted(known))}."
         )
     steps, values = np.array(points).T
     return Curve(steps, values)

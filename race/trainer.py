@@ -60,10 +60,6 @@ def train(
         if not _must_go_on(path, config, extend, state.progress):
             run_directory.mark_finished(path)
             return state.progress
-        if extend:
-            # In this order a kill in between leaves a run that is merely unfinished.
-            run_directory.clear_finished(path)
-            run_directory.change_config(path, config)
         n_tests = config.evaluation.episodes * (2 if config.has_population else 1)
         processes = config.env.processes
         with (
@@ -72,6 +68,11 @@ def train(
             MetricsWriter(directory.metrics, state.progress.metrics_offset) as metrics,
             Interrupts() as interrupts,
         ):
+            if extend:
+                # Once nothing can refuse the run any more, and in this order: a kill in between
+                # leaves a run that is merely unfinished.
+                run_directory.clear_finished(path)
+                run_directory.change_config(path, config)
             run = Run(
                 config=config,
                 task=task,

@@ -130,6 +130,16 @@ def test_a_failed_extension_changes_nothing(run: Path, capsys: pytest.CaptureFix
     assert metrics.read(run / "metrics.jsonl")[-1]["env_steps"] >= 150
 
 
+def test_a_run_with_damaged_metrics_stays_as_it_is(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truncate(run / "metrics.jsonl")
+    before = (run / "config.json").read_text()
+    assert "metrics.jsonl" in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "DONE").exists()
+    assert (run / "config.json").read_text() == before
+
+
 def test_a_budget_below_what_was_done_is_refused(
     trained: Path, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -229,6 +239,8 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         ("train probe/chain --checkpoint.minutes nan", "finite"),
         ("train probe/chain --learner.actor-learning-rate inf", "finite"),
         ("train probe/chain --seed -1", "from 0"),
+        ("train probe/chain --race.mine-size 100000000000", "at most"),
+        ("train probe/chain --learner.replay-capacity 100000000000", "at most"),
         ("train probe/chain --algo sarsa", "sarsa"),
         ("train probe/chain --learner.batch-size many", "many"),
         ("train", "required"),

@@ -235,11 +235,18 @@ class BrokenEnv(gymnasium.Env[Any, Any]):
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         reward = self._reward if BrokenEnv.episodes > 40 else 0.0
-        return np.zeros(2), reward, True, False, {}
+        # Without a bad reward it is the state that breaks.
+        broken = BrokenEnv.episodes > 40 and self._reward == 0
+        return np.full(2, np.nan if broken else 0.0), reward, True, False, {}
 
 
 @pytest.mark.parametrize(
-    ("reward", "complaint"), [(float("nan"), "return of team"), (1e30, "loss is no longer")]
+    ("reward", "complaint"),
+    [
+        (float("nan"), "return of team"),
+        (1e30, "loss is no longer"),
+        (0.0, "state that is not a finite number"),
+    ],
 )
 def test_what_is_not_finite_stops_the_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reward: float, complaint: str

@@ -21,6 +21,12 @@ COMMANDS = {
     "doctor": "show what is installed, what is missing and how to mend it",
 }
 
+_OUT_OF_MEMORY = (
+    "this machine does not have the memory for it. Use smaller networks or batches "
+    "(--learner.hidden-sizes, --learner.batch-size) or a smaller buffer "
+    "(--learner.replay-capacity)."
+)
+
 _EXAMPLE = """\
 For example:
   race train mamujoco/HalfCheetah-2x3 --seed 1 --env-steps 100000 --run-dir runs/first
@@ -50,6 +56,14 @@ def main(arguments: list[str] | None = None) -> None:
         importlib.import_module(f"race.cli.{command}").main(rest)
     except RaceError as error:
         print(f"race {command}: {error}", file=sys.stderr)
+        sys.exit(1)
+    except MemoryError:
+        print(f"race {command}: {_OUT_OF_MEMORY}", file=sys.stderr)
+        sys.exit(1)
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # what JAX calls it
+            raise
+        print(f"race {command}: {_OUT_OF_MEMORY}", file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         print(f"\nrace {command}: interrupted.", file=sys.stderr)

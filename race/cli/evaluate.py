@@ -22,7 +22,7 @@ class Evaluate:
     The same seed plays the same episodes. Progress goes to standard error.
     """
 
-    run_dir: Annotated[Path, tyro.conf.Positional]
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The run's directory."""
     team: TeamName = "selected"
     """The gradient learner's team, the population's team of best training fitness, or of these

@@ -15,7 +15,7 @@ class Plot:
     The interval is Student's t over seeds. Folders of runs are expanded.
     """
 
-    run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    run_dirs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR...")]
     """Run directories, or folders that hold some."""
     out: Path = Path("curves.png")
     """The figure: .png, .svg or .pdf."""

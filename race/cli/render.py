@@ -14,7 +14,7 @@ from race.errors import ConfigError, RenderError
 class Render:
     """Make a video of a trained team, without a display."""
 
-    run_dir: Annotated[Path, tyro.conf.Positional]
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The run's directory."""
     out: Path = Path("team.mp4")
     """The video: .mp4 or .gif."""

@@ -18,7 +18,7 @@ class Resume:
     again, number for number (times excepted) as if the run had never stopped.
     """
 
-    run_dir: Annotated[Path, tyro.conf.Positional]
+    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The run's directory."""
     env_steps: int | None = None
     """Train up to this many environment steps instead of what the run began with."""

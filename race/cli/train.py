@@ -26,11 +26,11 @@ class Train:
     """Train a team. Ctrl-C saves; `race resume DIR` goes on exactly where it was.
 
     One line per evaluation is printed; everything is in DIR/metrics.jsonl. Steps of all teams
-    count, and the last generation is always finished, so that a run ends a little after
-    --env-steps.
+    count, and the last generation, one episode of every team, is always finished: a run ends up
+    to that much after --env-steps.
     """
 
-    task: Annotated[str, tyro.conf.Positional]
+    task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """The task, such as mamujoco/HalfCheetah-2x3 (`race list` shows all), or
     package.module:function for your own."""
     algo: Algo = "race"

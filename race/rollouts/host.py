@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
+import traceback
 import warnings
 from collections.abc import Callable
 from types import TracebackType
@@ -14,7 +15,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from race.errors import DivergenceError
+from race.errors import DivergenceError, TaskError
 from race.types import EnvSpec, Rollout, Task, Transition
 
 Act = Callable[[NDArray[np.float32], int], Any]
@@ -93,8 +94,7 @@ class EnvPool:
             for team, env in enumerate(self._envs[:teams]):
                 states[team] = env.reset(seed=int(seeds[team]))[0]
         except Exception as error:
-            self._explain(error, "reset", team)
-            raise
+            raise self._failed(error, "reset", team) from error
         return states
 
     def step(
@@ -132,8 +132,7 @@ class EnvPool:
                 next_states[row] = state
                 rewards[row], terminated[row], truncated[row] = reward, ended, cut
         except Exception as error:
-            self._explain(error, "step", team)
-            raise
+            raise self._failed(error, "step", team) from error
 
     def close(self) -> None:
         """Closes the environments and ends their processes, also in the middle of a step."""
@@ -147,9 +146,15 @@ class EnvPool:
                 warnings.filterwarnings("ignore", message=".*Calling `close` while waiting.*")
                 workers.close(terminate=True)
 
-    def _explain(self, error: Exception, what: str, team: int | None) -> None:
-        where = f", environment {team}" if team is not None else ""
-        error.add_note(f"This happened in {what} of the environment of {self.spec.task}{where}.")
+    def _failed(self, error: Exception, what: str, team: int | None) -> TaskError:
+        which = f" (environment {team})" if team is not None else ""
+        frames = traceback.extract_tb(error.__traceback__)
+        place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+        return TaskError(
+            f"The environment of {self.spec.task} failed in its {what}{which}: "
+            f"{type(error).__name__}: {error}{place}. Its states must have "
+            f"{self.spec.state_size} entries, its rewards be numbers."
+        )
 
     def __enter__(self) -> "EnvPool":
         return self
@@ -183,6 +188,7 @@ def collect(
 
     Raises:
         DivergenceError: if a running team's action is not finite.
+        TaskError: if an environment fails.
     """
     spec = pool.spec
     teams = len(seeds)
