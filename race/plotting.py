@@ -247,7 +247,7 @@ def _panel(
             marker="o" if band.env_steps.size == 1 else None,
             label=f"{name} ({seeds})",
         )
-        if len(runs) > 1:
+        if len(runs) > 1 and label == "selected":  # bands of all teams would hide the lines
             low, high = band.mean - band.half_width, band.mean + band.half_width
             axes.fill_between(
                 band.env_steps, low, high, color=colours[method], alpha=0.18, linewidth=0

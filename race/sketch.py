@@ -1,11 +1,11 @@
 """Draws a MuJoCo model without OpenGL: rays against capsules, spheres, boxes and the ground.
 
 Slower machines and plain containers have no OpenGL to draw with. A robot of these tasks is a
-handful of simple solids, so numpy can cast the rays itself, with shading and a shadow, about as
-fast as OpenGL in software does.
+handful of simple solids, so numpy can cast the rays itself, with shading and a shadow.
 """
 
 import colorsys
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import mujoco
@@ -61,15 +61,22 @@ def draw(
     width, height = size
     camera = _camera(model, data, width * _OVERSAMPLING, height * _OVERSAMPLING)
     solids = _solids(model, data)
-    rays = _rays(camera, slice(0, camera.height), slice(0, camera.width))
+    rays = _rays(camera.view, camera.width, camera.height)
     ground = _ground_height(model, data)
     image, depth = _background(camera, rays, ground)
+    dark = np.zeros(depth.shape, np.bool_)
     for solid in solids:
-        _shadow(image, depth, camera, rays, solid, ground)
+        _shadow(dark, depth, camera, rays, solid, ground)
+    image[dark] *= 0.72
     for solid in solids:
         _paint(image, depth, camera, rays, solid)
-    image = image.reshape(height, _OVERSAMPLING, width, _OVERSAMPLING, 3).mean((1, 3))
-    pixels = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    # Strided sums: numpy's mean over short inner axes takes several times as long.
+    corners = [
+        image[row::_OVERSAMPLING, column::_OVERSAMPLING]
+        for row in range(_OVERSAMPLING)
+        for column in range(_OVERSAMPLING)
+    ]
+    pixels = (np.clip(sum(corners) / len(corners), 0, 1) * 255 + 0.5).astype(np.uint8)
     marks = _distance_marks(camera, ground) if camera.view == "side" else []
     return _write(pixels, marks, caption)
 
@@ -117,13 +124,21 @@ def focus(model: mujoco.MjModel, data: mujoco.MjData) -> Focus:
 
 def _camera(model: mujoco.MjModel, data: mujoco.MjData, width: int, height: int) -> _Camera:
     view, target, reach, backward, distance, _ = focus(model, data)
-    right = np.array([1.0, 0.0, 0.0]) if view != "corner" else np.cross([0, 0, 1.0], backward)
-    right /= np.linalg.norm(right)
-    focal = min(width, height) / 2 / np.tan(_HALF_ANGLE)
+    right, up, forward = _axes(view)
     eye = target + distance * backward
-    return _Camera(
-        view, eye, right, np.cross(backward, right), -backward, focal, width, height, reach
-    )
+    return _Camera(view, eye, right, up, forward, _focal(width, height), width, height, reach)
+
+
+def _axes(view: View) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """The image's right and up, and the direction of view: unit vectors."""
+    backward = _BACKWARDS[view] / np.linalg.norm(_BACKWARDS[view])
+    right = np.cross([0.0, 0.0, 1.0], backward)
+    right /= np.linalg.norm(right)
+    return right, np.cross(backward, right), -backward
+
+
+def _focal(width: int, height: int) -> float:
+    return min(width, height) / 2 / float(np.tan(_HALF_ANGLE))
 
 
 def _view(model: mujoco.MjModel) -> View:
@@ -162,14 +177,17 @@ def _visible(model: mujoco.MjModel) -> NDArray[np.bool_]:
     return (model.geom_group < 3) & (model.geom_rgba[:, 3] > 0)
 
 
-def _rays(camera: _Camera, rows: slice, columns: slice) -> NDArray[np.float32]:
-    """Unit directions through the pixels' centres, [h, w, 3]."""
-    x = (np.arange(columns.start, columns.stop) + 0.5 - camera.width / 2) / camera.focal
-    y = (camera.height / 2 - np.arange(rows.start, rows.stop) - 0.5) / camera.focal
-    rays = (camera.forward + x[None, :, None] * camera.right + y[:, None, None] * camera.up).astype(
-        np.float32
-    )
-    return rays / np.sqrt(np.einsum("hwc,hwc->hw", rays, rays))[..., None]
+@lru_cache(maxsize=2)
+def _rays(view: View, width: int, height: int) -> NDArray[np.float32]:
+    """Unit directions through the pixels' centres, [h, w, 3]: the camera moves, never turns."""
+    right, up, forward = _axes(view)
+    focal = _focal(width, height)
+    x = (np.arange(width) + 0.5 - width / 2) / focal
+    y = (height / 2 - np.arange(height) - 0.5) / focal
+    rays = forward + x[None, :, None] * right + y[:, None, None] * up
+    rays = (rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    rays.flags.writeable = False
+    return rays
 
 
 def _project(camera: _Camera, point: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -268,23 +286,32 @@ def _background(
     camera: _Camera, rays: NDArray[np.float32], ground: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The empty scene [h, w, 3] and the distance of the ground at each pixel [h, w] (metres)."""
-    slope = rays[..., 2]
-    rise = np.clip(slope * 1.6, 0, 1)[..., None]
-    sky = (_SKY_LOW + rise * (_SKY_HIGH - _SKY_LOW)).astype(np.float32)
-    above = camera.eye[2] - ground
-    depth = np.where(slope < -1e-4, above / np.maximum(-slope, 1e-4), np.inf).astype(np.float32)
-    if above <= 0:
-        return sky, np.full_like(depth, np.inf)
+    image = np.empty(rays.shape, np.float32)
+    depth = np.full(rays.shape[:2], np.inf, np.float32)
+    above = np.float32(camera.eye[2] - ground)
+    # The camera never rolls, so all of a row is sky or all of it is ground.
+    slope = rays[:, 0, 2]
+    horizon = int((slope >= -1e-4).sum()) if above > 0 else len(slope)
+    rise = np.clip(rays[:horizon, :, 2:] * 1.6, 0, 1)
+    image[:horizon] = _SKY_LOW + rise * (_SKY_HIGH - _SKY_LOW)
+    floor = rays[horizon:]
+    far = above / -floor[..., 2]
+    depth[horizon:] = far
     tile = _tile(camera)
-    far = np.where(np.isfinite(depth), depth, 0)
-    x = (camera.eye[0] + far * rays[..., 0]) / tile
-    y = (camera.eye[1] + far * rays[..., 1]) / tile
-    odd = ((np.floor(x) + np.floor(y)) % 2)[..., None]
-    tiles = _TILE_DARK + odd * (_TILE_LIGHT - _TILE_DARK)
+    x = np.floor((far * floor[..., 0] + np.float32(camera.eye[0])) / np.float32(tile))
+    y = np.floor((far * floor[..., 1] + np.float32(camera.eye[1])) / np.float32(tile))
+    odd = (x.astype(np.int32) + y.astype(np.int32)) & 1
     # Fog hides the horizon, where the tiles are finer than the pixels.
-    fog = (1 - np.exp(-((far / (14 * camera.reach)) ** 2)))[..., None]
-    floor = tiles + fog * (_SKY_LOW - tiles)
-    return np.where(np.isfinite(depth)[..., None], floor, sky).astype(np.float32), depth
+    clear = np.exp(-((far / np.float32(14 * camera.reach)) ** 2))
+    light = odd * clear
+    for channel in range(3):
+        dark, step = _TILE_DARK - _SKY_LOW, _TILE_LIGHT - _TILE_DARK
+        image[horizon:, :, channel] = (
+            np.float32(_SKY_LOW[channel])
+            + clear * np.float32(dark[channel])
+            + light * np.float32(step[channel])
+        )
+    return image, depth
 
 
 def _tile(camera: _Camera) -> float:
@@ -293,28 +320,24 @@ def _tile(camera: _Camera) -> float:
 
 
 def _shadow(
-    image: NDArray[np.float32],
+    dark: NDArray[np.bool_],
     depth: NDArray[np.float32],
     camera: _Camera,
     rays: NDArray[np.float32],
     solid: Solid,
     ground: float,
 ) -> None:
-    """Darkens, in place, the ground that the solid hides from the light."""
+    """Marks, in place, the ground that the solid hides from the light."""
     height = solid.centre[2] - ground
     if height < 0:
         return
     foot = solid.centre - _LIGHT * height / _LIGHT[2]
     window = _window(camera, foot, solid.bound / _LIGHT[2])
     far = depth[window]
-    if not far.size:
-        return
-    finite = np.isfinite(far)
-    points = camera.eye + np.where(finite, far, 0)[..., None] * rays[window]
-    blocked, _ = hit(solid, points, _LIGHT)
-    # Overlapping shadows are no darker than one: the colour is pulled down to a floor.
-    shade = finite & np.isfinite(blocked) & (image[window].sum(-1) > 1.7)
-    image[window][shade] *= 0.72
+    lit = np.isfinite(far) & ~dark[window]
+    points = camera.eye.astype(np.float32) + far[lit][:, None] * rays[window][lit]
+    blocked, _ = hit(solid, points, _LIGHT.astype(np.float32))
+    dark[window][lit] = np.isfinite(blocked)
 
 
 def _paint(
