@@ -13,6 +13,7 @@ from jaxtyping import PRNGKeyArray
 from numpy.typing import NDArray
 
 from race import programs
+from race.algorithms.base import tested_teams
 from race.clock import Clock
 from race.errors import DivergenceError
 from race.evaluation import evaluate
@@ -201,10 +202,7 @@ def test(run: Run, state: RunState) -> RunState:
     """Plays the test episodes and writes their row."""
     config, progress = run.config, state.progress
     run.report("evaluation", progress, {})
-    encoder, heads = run.algorithm.teams(state.algorithm)
-    played = {"marl": heads[-1]}
-    if config.has_population:
-        played["champion"] = run.algorithm.champion(state.algorithm)
+    encoder, played = tested_teams(run.algorithm, state.algorithm, config.has_population)
     seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, config.evaluation.episodes)
     scores = evaluate(run.test_pool, encoder, played, seeds, run.task.spec, config.base)
     row = evaluation_row(progress, scores)

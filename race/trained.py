@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from race import checkpoints, run_directory
 from race.algorithms import algorithm_of
-from race.algorithms.base import Teams
+from race.algorithms.base import Teams, tested_teams
 from race.config import Config, TeamName
 from race.envs import make_task
 from race.errors import ConfigError, RunDirectoryError
@@ -71,8 +71,5 @@ def load_trained(path: Path) -> Trained:
     saved = checkpoints.load(newest, tables=False)
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
-    encoder, heads = algorithm.teams(state)
-    named = {"marl": heads[-1]}
-    if config.has_population:
-        named["champion"] = algorithm.champion(state)
-    return Trained(config, task, progress_of(saved), encoder, named)
+    encoder, heads = tested_teams(algorithm, state, config.has_population)
+    return Trained(config, task, progress_of(saved), encoder, heads)

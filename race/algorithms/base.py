@@ -36,3 +36,14 @@ class Algorithm(NamedTuple):
     """state -> how often the injected team became elite, parent, discarded; shape [3]."""
     critic_losses: tuple[str, ...]
     policy_losses: tuple[str, ...]
+
+
+def tested_teams(
+    algorithm: Algorithm, state: Any, has_population: bool
+) -> tuple[Any, dict[str, Float[Array, "N H1 A"]]]:
+    """Encoders, and heads of the teams that are tested: ``marl`` and, if any, ``champion``."""
+    encoder, heads = algorithm.teams(state)
+    tested = {"marl": heads[-1]}
+    if has_population:
+        tested["champion"] = algorithm.champion(state)
+    return encoder, tested
