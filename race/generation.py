@@ -9,7 +9,6 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
 from numpy.typing import NDArray
 
 from race import programs
@@ -152,7 +151,7 @@ def evolve(run: Run, state: RunState, rollout: Rollout) -> RunState:
     if not run.config.has_population:
         return state
     fitness = jnp.asarray(rollout.episode_return[:-1], jnp.float32)
-    key = _key(run, Purpose.EVOLUTION, state.progress.generation)
+    key = jax.random.fold_in(root_key(run.config, Purpose.EVOLUTION), state.progress.generation)
     algorithm = programs.evolve(state.algorithm, fitness, key, **run.statics)
     return state._replace(algorithm=algorithm)
 
@@ -225,7 +224,3 @@ def _check_finite(rollout: Rollout, where: str) -> None:
                 "that is not a finite number. A fitness like that never wins, and a buffer that "
                 "holds it teaches nothing, so the run stops here. Look at the task's reward."
             )
-
-
-def _key(run: Run, purpose: Purpose, index: int) -> PRNGKeyArray:
-    return jax.random.fold_in(root_key(run.config, purpose), index)
