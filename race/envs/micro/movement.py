@@ -1,0 +1,143 @@
+"""How units walk, keep apart and stay on their ground."""
+
+from typing import Any, Final, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from race.envs.micro.scenario import Scenario
+from race.envs.micro.state import Units
+from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
+
+MOST_PUSHED: Final = 0.25
+"""How far others can push a unit in a game loop, in cells."""
+SWERVE: Final = 0.3
+"""Share of a push that also turns the unit aside, so that it finds its way round others."""
+
+
+class Course(NamedTuple):
+    """Where each unit wants to go in a game loop."""
+
+    x: Float[Any, "U"]
+    y: Float[Any, "U"]
+    distance: Float[Any, "U"]
+    """How far it wants to go towards (x, y); 0 to stay."""
+
+
+class Footing(NamedTuple):
+    """How firmly units stand against others that walk into them."""
+
+    fights: Bool[Any, "U"]
+    """Units in an attack yield to nobody."""
+    idle: Bool[Any, "U"]
+    """Idle units yield to friends and not to enemies."""
+
+
+def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> Units:
+    """One game loop of walking: own steps, then others' pushes, then walls."""
+    alive = units.health > 0
+    x, y = _way(scenario, units, course)
+    dx, dy = x - units.x, y - units.y
+    length = jnp.sqrt(dx * dx + dy * dy)
+    step = jnp.where(alive, jnp.minimum(scenario.speed, jnp.maximum(course.distance, 0.0)), 0.0)
+    if scenario.shape.flyers:
+        # Units that take time to slow down begin to do so in time.
+        braking = jnp.sqrt(2 * scenario.acceleration * jnp.maximum(course.distance, 0.0))
+        step = jnp.minimum(step, braking)
+    share = step / jnp.maximum(length, 1e-6)
+    vx, vy = dx * share, dy * share
+    if scenario.shape.flyers:
+        change_x, change_y = vx - units.vx, vy - units.vy
+        change = jnp.sqrt(change_x * change_x + change_y * change_y)
+        share = jnp.minimum(1.0, scenario.acceleration / jnp.maximum(change, 1e-6))
+        vx, vy = units.vx + change_x * share, units.vy + change_y * share
+        units = units._replace(vx=jnp.where(alive, vx, 0.0), vy=jnp.where(alive, vy, 0.0))
+    vx, vy = jnp.where(alive, vx, 0.0), jnp.where(alive, vy, 0.0)
+    push_x, push_y = _pushes(scenario, units.x + vx, units.y + vy, alive, footing)
+    new_x, new_y = _stop_at_walls(scenario, units, units.x + vx + push_x, units.y + vy + push_y)
+    return units._replace(x=jnp.where(alive, new_x, units.x), y=jnp.where(alive, new_y, units.y))
+
+
+def _way(
+    scenario: Scenario, units: Units, course: Course
+) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
+    """Where to head for: the goal, or the next corner on the way to it."""
+    if scenario.shape.plain:
+        return course.x, course.y
+    mover = scenario.mover
+    goal = scenario.node[mover, _cell(course.x), _cell(course.y)]
+    here = scenario.node[mover, _cell(units.x), _cell(units.y)]
+    corner = scenario.ways[mover, here, goal]
+    centre = scenario.centre[mover, corner]
+    straight = corner == goal
+    return (
+        jnp.where(straight, course.x, centre[:, 0]),
+        jnp.where(straight, course.y, centre[:, 1]),
+    )
+
+
+def _pushes(
+    scenario: Scenario,
+    x: Float[Any, "U"],
+    y: Float[Any, "U"],
+    alive: Bool[Any, "U"],
+    footing: Footing,
+) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
+    """What undoes overlaps, shared by how firmly the two units stand.
+
+    Of two equally firm units each takes half; a firm one takes none and leaves all to the other.
+    """
+    n, units = scenario.shape.n_allies, scenario.shape.n_units
+    # The dead are put out of everyone's way.
+    x = jnp.where(alive, x, 1000.0 + 10.0 * jnp.arange(units))
+    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+    overlap = jnp.maximum(scenario.contact - dx * dx - dy * dy, 0.0) * scenario.stiffness
+    with_friends = jnp.where(footing.fights, 0.5, 0.0)
+    with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
+    side = jnp.arange(units) < n
+    same = side[:, None] == side[None]
+    share = 0.5 + jnp.where(
+        same,
+        with_friends[None] - with_friends[:, None],
+        with_enemies[None] - with_enemies[:, None],
+    )
+    weight = overlap * share
+    push_x, push_y = jnp.sum(weight * dx, axis=1), jnp.sum(weight * dy, axis=1)
+    turn = jnp.where(footing.fights | footing.idle, 0.0, SWERVE)
+    turn = jnp.where(jnp.arange(units) % 2 == 0, turn, -turn)
+    push_x, push_y = push_x - turn * push_y, push_y + turn * push_x
+    length = jnp.sqrt(push_x * push_x + push_y * push_y)
+    share = jnp.where(
+        scenario.speed > 0, jnp.minimum(1.0, MOST_PUSHED / jnp.maximum(length, 1e-6)), 0.0
+    )
+    return push_x * share, push_y * share
+
+
+def _stop_at_walls(
+    scenario: Scenario, units: Units, x: Float[Any, "U"], y: Float[Any, "U"]
+) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
+    """Keeps centres at their inner radius from walls, first in x, then in y.
+
+    A unit that is nearer already, because it was created there, is not moved but comes no nearer.
+    """
+    low_x, high_x, low_y, high_y = scenario.bounds
+    if scenario.shape.plain:
+        return jnp.clip(x, low_x, high_x), jnp.clip(y, low_y, high_y)
+    walls, mover, inner = scenario.walls, scenario.mover, scenario.inner_radius
+
+    def between(
+        old: Float[Any, "U"], new: Float[Any, "U"], lower: Bool[Any, "U"], upper: Bool[Any, "U"]
+    ) -> Float[Any, "U"]:
+        cell = jnp.floor(old)
+        new = jnp.where(upper, jnp.minimum(new, jnp.maximum(cell + 1 - inner, old)), new)
+        return jnp.where(lower, jnp.maximum(new, jnp.minimum(cell + inner, old)), new)
+
+    beside = walls[mover, _cell(units.x), _cell(units.y)]
+    x = between(units.x, x, (beside & WEST) > 0, (beside & EAST) > 0)
+    beside = walls[mover, _cell(x), _cell(units.y)]
+    y = between(units.y, y, (beside & SOUTH) > 0, (beside & NORTH) > 0)
+    return x, y
+
+
+def _cell(place: Float[Any, "U"]) -> Int[Any, "U"]:
+    return jnp.floor(place).astype(jnp.int32)

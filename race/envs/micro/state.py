@@ -1,0 +1,84 @@
+"""What changes in a battle."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Bool, Float, Int
+
+from race.envs.micro.scenario import Scenario
+from race.envs.micro.units import START_ENERGY
+
+NOBODY = -1
+
+
+class Units(NamedTuple):
+    """All units of a battle; ``U`` units, allies first. A unit is dead when its health is 0.
+
+    Times are in game loops, lengths in cells. Units are named by their number.
+    """
+
+    x: Float[Any, "U"]
+    y: Float[Any, "U"]
+    vx: Float[Any, "U"]
+    """Velocity in cells per game loop; kept for units that need time to speed up."""
+    vy: Float[Any, "U"]
+    health: Float[Any, "U"]
+    shield: Float[Any, "U"]
+    energy: Float[Any, "U"]
+    cooldown: Float[Any, "U"]
+    """Until the weapon is ready."""
+    since_hit: Float[Any, "U"]
+    """Since the last damage taken."""
+    target: Int[Any, "U"]
+    """Whom the unit attacks or heals."""
+    aiming: Float[Any, "U"]
+    """Loops the unit has aimed at its target, this one included; 0 if it does not aim."""
+    pending: Float[Any, "U"]
+    """Until the next hit of the last attack lands; 0 if none is under way."""
+    struck: Int[Any, "U"]
+    """Whom the last attack was aimed at."""
+    struck_by: Int[Any, "m"]
+    """An ally that hit the enemy in this step."""
+    burst: Bool[Any, "U"]
+    """Whether the unit has burst."""
+    beam: Float[Any, "beams 4"]
+    """Middle (x, y) of each beam's line and the direction (x, y) of the shot across it."""
+
+
+class EnvState(NamedTuple):
+    """The state of the environment between two steps."""
+
+    units: Units
+    steps: Int[Any, ""]
+    last_actions: Int[Any, "n"]
+    """-1 after a reset."""
+    over: Bool[Any, ""]
+    """Whether the battle has ended; further steps change nothing."""
+
+
+def start(scenario: Scenario) -> EnvState:
+    """The start of a battle. There is no chance in it: every battle begins the same."""
+    shape = scenario.shape
+    zeros = jnp.zeros(shape.n_units)
+    nobody = jnp.full(shape.n_units, NOBODY)
+    units = Units(
+        x=scenario.x,
+        y=scenario.y,
+        vx=zeros,
+        vy=zeros,
+        health=scenario.max_health,
+        shield=scenario.max_shield,
+        energy=zeros.at[scenario.healers].set(START_ENERGY),
+        cooldown=zeros,
+        since_hit=zeros,
+        target=nobody,
+        aiming=zeros,
+        pending=zeros,
+        struck=nobody,
+        struck_by=jnp.full(shape.n_enemies, NOBODY),
+        burst=zeros > 0,
+        beam=jnp.zeros((shape.n_beams, 4)),
+    )
+    return EnvState(
+        units, jnp.zeros((), int), jnp.full(shape.n_allies, NOBODY), jnp.zeros((), bool)
+    )
