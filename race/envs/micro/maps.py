@@ -85,7 +85,7 @@ class EnemyOrder(NamedTuple):
     """What the enemies are told at the start.
 
     ``attack_move``: go to (x, y) and fight what comes near on the way. ``attack_nearest``: each
-    follows the ally that is nearest at the start until it dies. ``hold``: nothing; they fight what
+    attacks the ally that is nearest to it, wherever that is. ``hold``: nothing; they fight what
     comes near.
     """
 

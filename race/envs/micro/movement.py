@@ -2,6 +2,7 @@
 
 from typing import Any, Final, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Bool, Float, Int
 
@@ -11,7 +12,7 @@ from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
 
 MOST_PUSHED: Final = 0.25
 """How far others can push a unit in a game loop, in cells."""
-SWERVE: Final = 0.3
+SWERVE: Final = 1.0
 """Share of a push that also turns the unit aside, so that it finds its way round others."""
 
 
@@ -53,7 +54,7 @@ def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> 
         vx, vy = units.vx + change_x * share, units.vy + change_y * share
         units = units._replace(vx=jnp.where(alive, vx, 0.0), vy=jnp.where(alive, vy, 0.0))
     vx, vy = jnp.where(alive, vx, 0.0), jnp.where(alive, vy, 0.0)
-    push_x, push_y = _pushes(scenario, units.x + vx, units.y + vy, alive, footing)
+    push_x, push_y = _pushes(scenario, units, vx, vy, footing)
     new_x, new_y = _stop_at_walls(scenario, units, units.x + vx + push_x, units.y + vy + push_y)
     return units._replace(x=jnp.where(alive, new_x, units.x), y=jnp.where(alive, new_y, units.y))
 
@@ -78,23 +79,25 @@ def _way(
 
 def _pushes(
     scenario: Scenario,
-    x: Float[Any, "U"],
-    y: Float[Any, "U"],
-    alive: Bool[Any, "U"],
+    units: Units,
+    vx: Float[Any, "U"],
+    vy: Float[Any, "U"],
     footing: Footing,
 ) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
     """What undoes overlaps, shared by how firmly the two units stand.
 
     Of two equally firm units each takes half; a firm one takes none and leaves all to the other.
     """
-    n, units = scenario.shape.n_allies, scenario.shape.n_units
+    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
     # The dead are put out of everyone's way.
-    x = jnp.where(alive, x, 1000.0 + 10.0 * jnp.arange(units))
+    x = jnp.where(units.health > 0, units.x + vx, 1000.0 + 10.0 * everyone)
+    y = units.y + vy
     dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-    overlap = jnp.maximum(scenario.contact - dx * dx - dy * dy, 0.0) * scenario.stiffness
+    near = jax.lax.rsqrt(jnp.maximum(dx * dx + dy * dy, 1e-6))
+    overlap = jnp.maximum(scenario.contact * near - 1.0, 0.0) * scenario.stiffness
     with_friends = jnp.where(footing.fights, 0.5, 0.0)
     with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
-    side = jnp.arange(units) < n
+    side = everyone < n
     same = side[:, None] == side[None]
     share = 0.5 + jnp.where(
         same,
@@ -104,7 +107,8 @@ def _pushes(
     weight = overlap * share
     push_x, push_y = jnp.sum(weight * dx, axis=1), jnp.sum(weight * dy, axis=1)
     turn = jnp.where(footing.fights | footing.idle, 0.0, SWERVE)
-    turn = jnp.where(jnp.arange(units) % 2 == 0, turn, -turn)
+    # To the side that also brings it on.
+    turn = jnp.where(vy * push_x - vx * push_y >= 0, turn, -turn)
     push_x, push_y = push_x - turn * push_y, push_y + turn * push_x
     length = jnp.sqrt(push_x * push_x + push_y * push_y)
     share = jnp.where(

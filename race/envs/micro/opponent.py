@@ -75,8 +75,7 @@ def choose_targets(scenario: Scenario, units: Units) -> Int[Any, "m"]:
     attacker = units.struck_by
     answers = still(attacker) & jnp.isfinite(scenario.reluctance[rows, attacker])
     other = jnp.where(chased, current, jnp.where(answers, attacker, NOBODY))
-    target = jnp.where(found, nearest, other)
-    return jnp.where(still(scenario.assigned), scenario.assigned, target)
+    return jnp.where(found, nearest, other)
 
 
 def choose_patients(scenario: Scenario, units: Units) -> Int[Any, "healers"]:

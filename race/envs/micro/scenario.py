@@ -24,7 +24,7 @@ REWARD_DEATH: Final = 10.0
 REWARD_WIN: Final = 200.0
 REWARD_SCALE: Final = 20.0
 """SMAC divides rewards by the highest return over this."""
-STIFFNESS: Final = 0.5
+STIFFNESS: Final = 1.0
 """Share of an overlap that two units undo together in a game loop."""
 AIR_STIFFNESS: Final = 0.05
 """The same for flyers, which drift apart slowly."""
@@ -142,12 +142,10 @@ class Scenario:
     goal_x: Float[Any, "m"]
     """Where an enemy walks that has nothing to fight."""
     goal_y: Float[Any, "m"]
-    assigned: Int[Any, "m"]
-    """The ally an enemy follows until it dies; -1 for none."""
 
     # Crowding.
     contact: Float[Any, "U U"]
-    """Square of the centre distance at which two units touch; 0 if they pass each other."""
+    """Centre distance at which two units touch; 0 if they pass each other."""
     stiffness: Float[Any, "U U"]
 
     # SMAC's features.
@@ -226,12 +224,11 @@ def _build(spec: MapSpec) -> Scenario:
         armour=_f([t.armour for t in types]),
         burst_damage=burst_damage,
         burst_armour=burst_armour,
-        scan=_reach(types, n, SCAN_RANGE),
+        scan=_reach(types, n, np.inf if spec.enemy_order.kind == "attack_nearest" else SCAN_RANGE),
         reach=_reach(types, n, 0.0),
         reluctance=_reluctance(types, n, damage),
         goal_x=_f(goals[n:, 0]),
         goal_y=_f(goals[n:, 1]),
-        assigned=_assigned(spec, places, n),
         contact=contact,
         stiffness=stiffness,
         cooldown_scale=_f(
@@ -364,26 +361,16 @@ def _goals(spec: MapSpec, places: NDArray[np.float64]) -> NDArray[np.float64]:
     return goals
 
 
-def _assigned(spec: MapSpec, places: NDArray[np.float64], n: int) -> NDArray[np.int32]:
-    if spec.enemy_order.kind != "attack_nearest":
-        return np.full(len(places) - n, -1, np.int32)
-    distance = np.square(places[n:, None] - places[None, :n]).sum(-1)
-    return distance.argmin(-1).astype(np.int32)
-
-
 def _contacts(types: list[UnitType]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     separation = np.array([t.separation for t in types])
-    contact = np.square(separation[:, None] + separation[None])
+    contact = separation[:, None] + separation[None]
     stiffness = np.zeros_like(contact)
     for i, one in enumerate(types):
         for j, other in enumerate(types):
             if i != j and _collide(one, other):
                 both_fly = one.mover is Mover.AIR
                 stiffness[i, j] = AIR_STIFFNESS if both_fly else STIFFNESS
-    contact = np.where(stiffness > 0, contact, 0.0)
-    # An overlap of c - d between centres at distance d, along the unit vector (dx, dy) / d, is
-    # dx (c^2 - d^2) / (2 c^2) to first order near contact: no root and no division in a battle.
-    return _f(contact), _f(stiffness / np.where(contact > 0, 2 * contact, 1.0))
+    return _f(np.where(stiffness > 0, contact, 0.0)), _f(stiffness)
 
 
 def _collide(one: UnitType, other: UnitType) -> bool:

@@ -1,0 +1,96 @@
+"""Battles played from start to end with every game loop kept, for pictures of them."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from race.envs.micro import Battle, battle, smac
+from race.envs.micro.policies import Policy
+from race.envs.micro.scenario import Scenario
+from race.envs.micro.smac import Info, Observation, Timestep
+from race.envs.micro.state import EnvState, Units
+
+
+class Recording(NamedTuple):
+    """A battle that was played; ``L`` moments: the start, then after each game loop."""
+
+    units: Units
+    """As numpy arrays with a leading axis ``L``."""
+    returns: Float[np.ndarray, "steps"]
+    """Sum of the rewards after each step."""
+    verdict: str
+    """``won``, ``lost``, ``draw`` or ``time``; empty if the battle was not played to its end."""
+
+
+def step_and_film(
+    scenario: Scenario, env_state: EnvState, actions: Int[Array, "n"], key: Key[Array, ""]
+) -> tuple[EnvState, Timestep, Units]:
+    """`race.envs.micro.smac.step`, and the units after each of its eight game loops.
+
+    The film shows the actions that were taken, not those that were refused. After the end of a
+    battle nothing moves.
+    """
+    after, timestep = smac.step(scenario, env_state, actions, key)
+    given = battle.orders(scenario, env_state.units, after.last_actions)
+    film = battle.film(scenario, env_state.units, given, key)
+
+    def frozen_if_over(still: Array, moving: Array) -> Array:
+        return jnp.where(env_state.over, jnp.broadcast_to(still, moving.shape), moving)
+
+    return after, timestep, jax.tree.map(frozen_if_over, env_state.units, film)
+
+
+def play(played: Battle, policy: Policy, seed: int, most_steps: int | None = None) -> Recording:
+    """One battle under a policy. The same seed gives the same battle.
+
+    Args:
+        played: the map.
+        policy: chooses the actions of all agents; it must be jittable.
+        seed: of everything random.
+        most_steps: stop after so many environment steps; None for the whole battle.
+    """
+    start, key = jax.random.split(jax.random.key(seed))
+    env_state, observation = played.reset(start)
+    films = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], env_state.units)]
+    rewards: list[float] = []
+    verdict = ""
+    limit = played.spec.episode_limit
+    for _ in range(limit if most_steps is None else min(most_steps, limit)):
+        key, now = jax.random.split(key)
+        env_state, timestep, film = _play_step(policy, played.scenario, env_state, observation, now)
+        observation = timestep.observation
+        films.append(jax.tree.map(np.asarray, film))
+        rewards.append(float(timestep.reward))
+        if timestep.terminated:
+            verdict = verdict_of(played.scenario, timestep.info)
+            break
+    units = jax.tree.map(lambda *leaves: np.concatenate(leaves), *films)
+    return Recording(units, np.cumsum(np.array(rewards, np.float64)), verdict)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _play_step(
+    policy: Policy,
+    scenario: Scenario,
+    env_state: EnvState,
+    observation: Observation,
+    key: Key[Array, ""],
+) -> tuple[EnvState, Timestep, Units]:
+    mind, world = jax.random.split(key)
+    actions = policy(scenario, env_state, observation, mind)
+    return step_and_film(scenario, env_state, actions, world)
+
+
+def verdict_of(scenario: Scenario, info: Info) -> str:
+    """How a battle ended: ``won``, ``lost``, ``draw`` (nobody is left) or ``time``."""
+    if info.battle_won:
+        return "won"
+    if info.timed_out:
+        return "time"
+    shape = scenario.shape
+    nobody = info.dead_allies == shape.n_allies and info.dead_enemies == shape.n_enemies
+    return "draw" if nobody else "lost"
