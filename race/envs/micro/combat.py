@@ -119,7 +119,8 @@ def strike(
         health=jnp.where(fires & scenario.bursting, 0.0, units.health),
     )
     n = shape.n_allies
-    first = scenario.damage * (victim[:, None] == jnp.arange(shape.n_units)[None])
+    struck = victim[:, None] == jnp.arange(shape.n_units)[None]
+    first = jnp.where(struck, scenario.damage, 0.0)
     second = first[scenario.beams] * (scenario.hits[scenario.beams] - 1)[:, None]
     armour = scenario.armour
     ally_hits = [first[:n, n:], second[:, n:], others[:, n:], others[:, n:]]
@@ -224,7 +225,7 @@ def _beam(
     along = jnp.maximum(jnp.abs(away_y * dx - away_x * dy) - BEAM_HALF_LENGTH, 0.0)
     touched = across**2 + along**2 <= (BEAM_RADIUS + scenario.radius[None]) ** 2
     main = jnp.arange(scenario.shape.n_units)[None] == units.struck[beams][:, None]
-    return scenario.damage[beams] * (touched & ~main & now[:, None] & alive[None])
+    return jnp.where(touched & ~main & now[:, None] & alive[None], scenario.damage[beams], 0.0)
 
 
 def _explode(scenario: Scenario, units: Units) -> Units:
@@ -238,7 +239,7 @@ def _explode(scenario: Scenario, units: Units) -> Units:
     bursts = scenario.bursting & (units.health <= 0) & ~units.burst
     distance = jnp.hypot(units.x[:, None] - units.x[None], units.y[:, None] - units.y[None])
     near = bursts[:, None] & (distance <= scenario.burst_reach) & (units.health > 0)[None]
-    hits = scenario.burst_damage * near
+    hits = jnp.where(near, scenario.burst_damage, 0.0)
     units = units._replace(burst=units.burst | bursts)
     return _take(
         units,

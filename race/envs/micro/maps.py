@@ -121,7 +121,7 @@ class MapSpec:
     rows: tuple[str, ...] = PLAIN
 
     @cached_property
-    def cells(self) -> NDArray[np.str_]:
+    def cells(self) -> NDArray[Any]:
         """Kind of each cell, indexed [x, y], y upwards."""
         return np.array([list(row) for row in self.rows])[::-1].T
 

@@ -90,7 +90,7 @@ def _pushes(
     """
     n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
     # The dead are put out of everyone's way.
-    x = jnp.where(units.health > 0, units.x + vx, 1000.0 + 10.0 * everyone)
+    x = jnp.where(units.health > 0, units.x + vx, 1000.0 + 10.0 * everyone.astype(jnp.float32))
     y = units.y + vy
     dx, dy = x[:, None] - x[None], y[:, None] - y[None]
     near = jax.lax.rsqrt(jnp.maximum(dx * dx + dy * dy, 1e-6))

@@ -86,7 +86,8 @@ def choose_patients(scenario: Scenario, units: Units) -> Int[Any, "healers"]:
     """
     healers, n = scenario.healers, scenario.shape.n_allies
     everyone = jnp.arange(scenario.shape.n_units)
-    friends = ((healers < n)[:, None] == (everyone < n)[None]) & (everyone != healers[:, None])
+    friends = (healers < n)[:, None] == (everyone < n)[None]
+    friends &= everyone[None] != healers[:, None]
     hurt = (units.health > 0) & (units.health < scenario.max_health) & scenario.biological
     gap = gaps(scenario, units, healers)
     kept = (everyone[None] == units.target[healers][:, None]) & (gap <= HEAL_RANGE + CAST_SLOP)

@@ -1,7 +1,7 @@
 """Battles played from start to end with every game loop kept, for pictures of them."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ class Recording(NamedTuple):
 
 
 def step_and_film(
-    scenario: Scenario, env_state: EnvState, actions: Int[Array, "n"], key: Key[Array, ""]
+    scenario: Scenario, env_state: EnvState, actions: Int[Any, "n"], key: Key[Array, ""]
 ) -> tuple[EnvState, Timestep, Units]:
     """`race.envs.micro.smac.step`, and the units after each of its eight game loops.
 
@@ -50,7 +50,7 @@ def play(played: Battle, policy: Policy, seed: int, most_steps: int | None = Non
     Args:
         played: the map.
         policy: chooses the actions of all agents; it must be jittable.
-        seed: of everything random.
+        seed: of everything random, below 2**32.
         most_steps: stop after so many environment steps; None for the whole battle.
     """
     start, key = jax.random.split(jax.random.key(seed))

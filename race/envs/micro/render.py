@@ -15,7 +15,7 @@ from race.envs.micro.combat import BEAM_HALF_LENGTH
 from race.envs.micro.maps import WALL, MapSpec
 from race.envs.micro.recording import Recording
 from race.envs.micro.state import Units
-from race.envs.micro.units import LOOPS_PER_SECOND, MAX_ENERGY, UNIT_TYPES
+from race.envs.micro.units import LOOPS_PER_SECOND, MAX_ENERGY, UNIT_TYPES, Mover
 
 FPS: Final = LOOPS_PER_SECOND
 """Frames per second for playback at the game's "normal" speed: one frame is one game loop."""
@@ -100,7 +100,7 @@ def used(spec: MapSpec, units: Units) -> Window:
 def _span(places: Any, least: float, size: int) -> tuple[float, float]:
     low, high = float(places.min()) - _MARGIN, float(places.max()) + _MARGIN
     missing = max(least - (high - low), 0.0) / 2
-    return max(math.floor(low - missing), 0.0), min(math.ceil(high + missing), float(size))
+    return float(max(math.floor(low - missing), 0)), float(min(math.ceil(high + missing), size))
 
 
 @final
@@ -150,12 +150,16 @@ class Painter:
         units, pen = self._now, self._canvas.begin()
         living = [k for k in range(self._units) if units.health[k] > 0]
         flyers = [k for k in living if self._scenario.flying[k]]
-        walkers = [k for k in living if not self._scenario.flying[k]]
+        # Those that climb are tall and walk over others.
+        walkers = [k for k in living if self._types[k].mover is Mover.GROUND]
+        walkers += [k for k in living if self._types[k].mover is Mover.CLIFF]
         self._traces(pen, units)
         for k in walkers:
             self._body(pen, units, k)
         for k in walkers:
             self._bars(pen, units, k)
+        for k in walkers:
+            self._label(pen, units, k)
         for k in range(self._units):
             self._attack(pen, units, k)
         for k in flyers:
@@ -164,6 +168,7 @@ class Painter:
         for k in flyers:
             self._body(pen, units, k)
             self._bars(pen, units, k)
+            self._label(pen, units, k)
         return pen.finish(*self._caption(units, step, episode_return, verdict))
 
     def _traces(self, pen: Pen, units: Units) -> None:
@@ -185,12 +190,14 @@ class Painter:
             _at(units, k),
             radius,
             color,
-            opacity=0.8 if self._scenario.flying[k] else 1.0,
+            opacity=1.0 if self._types[k].mover is Mover.GROUND else 0.8,
             rim=mixed(mixed(color, _DARK, 0.45), WHITE, hit),
             rim_width=0.07 + 0.05 * hit,
         )
+
+    def _label(self, pen: Pen, units: Units, k: int) -> None:
         number = str(k) if k < self._n else ""
-        pen.label(_at(units, k), 2 * radius, self._types[k].letter, number)
+        pen.label(_at(units, k), 2 * self._types[k].radius, self._types[k].letter, number)
 
     def _bars(self, pen: Pen, units: Units, k: int) -> None:
         kind = self._types[k]
@@ -264,9 +271,9 @@ class Painter:
         def on_line(along: float) -> Point:
             return x - dy * along * BEAM_HALF_LENGTH, y + dx * along * BEAM_HALF_LENGTH
 
-        pen.line(on_line(-1), on_line(1), _BEAM, 0.3 + 0.6 * min(2 - 2 * share, 1.0), width=0.3)
+        pen.line(on_line(-1.0), on_line(1.0), _BEAM, 0.3 + 0.6 * min(2 - 2 * share, 1.0), width=0.3)
         if share < 0.5:
-            for side in (-1, 1):
+            for side in (-1.0, 1.0):
                 pen.line(_at(units, k), on_line(side * (1 - 4 * share)), _BEAM, 0.8)
 
     def _shot(self, k: int) -> Color:

@@ -4,7 +4,7 @@ All of it is worked out once per map, in numpy. Units then look up two tables: t
 their cell, and the next cell to head for on the way to another.
 """
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,9 +46,7 @@ class Terrain(NamedTuple):
     walkable: NDArray[np.bool_]
 
 
-def survey(
-    cells: NDArray[np.str_], movers: tuple[Mover, ...], starts: NDArray[np.float64]
-) -> Terrain:
+def survey(cells: NDArray[Any], movers: tuple[Mover, ...], starts: NDArray[np.float64]) -> Terrain:
     """The tables of a map.
 
     Args:
@@ -82,7 +80,7 @@ def survey(
     )
 
 
-def _enterable(cells: NDArray[np.str_], mover: Mover) -> NDArray[np.bool_]:
+def _enterable(cells: NDArray[Any], mover: Mover) -> NDArray[np.bool_]:
     match mover:
         case Mover.GROUND:
             return cells == GROUND
