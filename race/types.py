@@ -184,6 +184,39 @@ def _padded(index: tuple[tuple[int, ...], ...], size: int) -> NDArray[np.int32]:
     return np.array([[*agent, *[0] * (size - len(agent))] for agent in index], np.int32)
 
 
+@dataclass(frozen=True)
+class DiscreteSpec:
+    """The sizes of a task whose agents each choose one of a number of actions. Hashable.
+
+    Attributes:
+        task: the task's id.
+        n_agents: number of agents N.
+        obs_size: entries of an agent's observation O.
+        state_size: entries of the global state S.
+        n_actions: actions that each agent has to choose from; not all are always available.
+        episode_limit: steps after which an episode ends.
+    """
+
+    task: str
+    n_agents: int
+    obs_size: int
+    state_size: int
+    n_actions: int
+    episode_limit: int
+
+
+class DiscreteTask(NamedTuple):
+    """A task with discrete actions: its sizes and the way to make its environment.
+
+    ``make(render_mode)`` returns a `gymnasium.Env` whose observation is a dictionary of ``obs``
+    [N, O], ``state`` [S] and ``avail_actions`` [N, n_actions], and whose action is one number per
+    agent, [N]. ``render_mode`` is None or ``"rgb_array"``.
+    """
+
+    spec: DiscreteSpec
+    make: Callable[[str | None], gymnasium.Env[Any, Any]]
+
+
 class Task(NamedTuple):
     """A task: its factorisation and the way to make its environment.
 

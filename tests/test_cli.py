@@ -216,10 +216,38 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     listing = json.loads(capsys.readouterr().out)
     tasks = {task["id"]: task for task in listing["tasks"]}
     assert (tasks["mamujoco/Ant-2x4d"]["alpha"], tasks["mamujoco/Ant-2x4d"]["beta"]) == (0.2, 1e-2)
-    assert sum(task["paper_name"] is not None for task in tasks.values()) == 8
+    assert sum(task["paper_name"] is not None for task in tasks.values()) == 16
+    battle = tasks["micro/MMM2"]
+    sizes = ("agents", "enemies", "actions", "obs", "state", "limit", "alpha", "beta")
+    assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, None, None]
     assert set(listing["algorithms"]) == {"race", "matd3", "maddpg"}
     race("list")
-    assert "mamujoco/HumanoidStandup-9x8" in capsys.readouterr().out
+    table = capsys.readouterr().out
+    assert "mamujoco/HumanoidStandup-9x8" in table
+    assert "micro/so_many_baneling" in table
+
+
+def test_render_a_battle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # The enemies are out of sight and hold, and the time limit is two steps.
+    Path("quiet.toml").write_text(
+        'description = "quiet"\nepisode_limit = 2\nenemy_order = { kind = "hold" }\n'
+        'allies = [{ unit = "Marine", count = 1, at = [4.0, 16.0] }]\n'
+        'enemies = [{ unit = "Marine", count = 1, at = [28.0, 16.0] }]\n'
+    )
+    race("render micro/quiet.toml --policy random")
+    line = capsys.readouterr().out
+    match = re.fullmatch(
+        r"battle\.gif: (\d+) frames, 2 steps of the random policy, return 0, time\n", line
+    )
+    assert match is not None, line
+    assert int(match[1]) > 17
+    race("render micro/quiet.toml --seconds 0.3 --out first.mp4")
+    line = capsys.readouterr().out
+    assert line == "first.mp4: 9 frames, 1 steps of the scripted policy, return 0, not finished\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"quiet.toml", "battle.gif", "first.mp4"}
 
 
 @pytest.mark.parametrize(
@@ -249,6 +277,16 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
         ("resume nowhere", "not the directory of a run"),
         ("render nowhere", "not the directory of a run"),
         ("render nowhere --out team.avi", ".mp4 or .gif"),
+        ("render nowhere --policy random", "--team"),
+        ("render micro/2s3y", "2s3z"),
+        ("render micro/nowhere.toml", "cannot be read"),
+        ("render micro/2s3z --out battle.avi", ".mp4 or .gif"),
+        ("render micro/2s3z --team marl", "--policy"),
+        ("render micro/2s3z --policy best", "scripted"),
+        ("render micro/2s3z --seconds nan", "0 or more"),
+        ("render micro/2s3z --seed 4294967296", "below"),
+        ("train micro/2s3z", "race render micro/2s3z"),
+        ("train micro/2s3y", "2s3z"),
         ("plot", "which runs"),
         ("plot nowhere", "not a directory"),
     ],

@@ -38,6 +38,7 @@ def main(arguments: list[str]) -> None:
             "tasks": [
                 {
                     **info._asdict(),
+                    **_battle_sizes(info.id),
                     "alpha": TABLE_3.get(info.id, (None, None))[0],
                     "beta": TABLE_3.get(info.id, (None, None))[1],
                 }
@@ -71,3 +72,21 @@ def main(arguments: list[str]) -> None:
             f"Adam {preset.actor_learning_rate:g}, {preset.random_steps:,} random steps",
         )
     console.print(presets)
+
+
+def _battle_sizes(task_id: str) -> dict[str, int]:
+    """Agents, enemies, actions, entries of observations and state, and step limit of a battle."""
+    if not task_id.startswith("micro/"):
+        return {}
+    from race.envs import make_discrete_task
+    from race.envs.micro import load_map
+
+    spec = make_discrete_task(task_id).spec
+    return {
+        "agents": spec.n_agents,
+        "enemies": len(load_map(task_id.removeprefix("micro/")).enemies),
+        "actions": spec.n_actions,
+        "obs": spec.obs_size,
+        "state": spec.state_size,
+        "limit": spec.episode_limit,
+    }

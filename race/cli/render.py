@@ -1,39 +1,105 @@
 """``race render``."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
 from race.config import TeamName
 from race.errors import ConfigError, RenderError
 
+PolicyName = Literal["scripted", "random"]
+
 
 @dataclass(frozen=True)
 class Render:
-    """Make a video of a trained team, without a display."""
+    """Make a video of a trained team, or of a micromanagement battle, without a display.
 
-    run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The run's directory."""
-    out: Path = Path("team.mp4")
-    """The video: .mp4 or .gif."""
-    team: TeamName = "selected"
-    """The gradient learner's team, the population's team of best training fitness, or of these
-    two the one with the better training return."""
+    `race render runs/first` shows the team of a run. `race render micro/2s3z` shows a battle of
+    agents that have learned nothing; `race list` names the maps, and micro/PATH.toml is your own.
+    """
+
+    what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DIR|micro/MAP")]
+    """The directory of a run, or a battle."""
+    out: Path | None = None
+    """The video: .mp4 or .gif. Default: team.mp4 of a run, battle.gif of a battle."""
+    team: TeamName | None = None
+    """Of a run: the gradient learner's team (marl), the population's team of best training
+    fitness (champion), or of these two the one with the better training return (selected, the
+    default)."""
+    policy: PolicyName | None = None
+    """Of a battle: all agents attack the weakest enemy in reach (scripted, the default), or do
+    anything that is allowed (random)."""
     seed: int = 0
     """Seed of the episode."""
-    seconds: float = 15.0
-    """Simulated time to show; 0 for the whole episode."""
+    seconds: float | None = None
+    """Simulated time to show; 0 for the whole episode. Default: 15 of a run, the whole of a
+    battle."""
 
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments, plays an episode and writes it."""
     chosen = tyro.cli(Render, args=arguments, prog="race render")
-    if chosen.out.suffix.lower() not in (".mp4", ".gif"):
-        raise RenderError(f"{chosen.out} is no video: the name must end with .mp4 or .gif.")
-    if chosen.seed < 0 or not 0 <= chosen.seconds < float("inf"):
+    # A directory of that name is a run.
+    battle = chosen.what.startswith("micro/") and not Path(chosen.what).is_dir()
+    out = chosen.out or Path("battle.gif" if battle else "team.mp4")
+    if out.suffix.lower() not in (".mp4", ".gif"):
+        raise RenderError(f"{out} is no video: the name must end with .mp4 or .gif.")
+    seconds = chosen.seconds if chosen.seconds is not None else 0.0 if battle else 15.0
+    if chosen.seed < 0 or not 0 <= seconds < float("inf"):
         raise ConfigError("--seed and --seconds must be 0 or more.")
+    if battle:
+        _render_battle(chosen, out, seconds)
+    else:
+        _render_run(chosen, out, seconds)
+
+
+def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
+    if chosen.team is not None:
+        raise ConfigError(
+            f"--team is for runs, and {chosen.what} is a battle that no team was trained for: "
+            "leave it out, or choose --policy scripted or random."
+        )
+    if chosen.seed >= 2**32:
+        raise ConfigError(f"The --seed of a battle must be below {2**32}.")
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from race.cli.compilation import use_cache
+    from race.cli.progress import rounded
+    from race.envs.micro import make, render
+    from race.envs.micro.environment import STEPS_PER_SECOND
+    from race.envs.micro.policies import POLICIES
+    from race.envs.micro.recording import play
+    from race.rendering import write_video
+
+    use_cache()
+    console, policy = Console(stderr=True), chosen.policy or "scripted"
+    with console.status("playing the battle"):
+        played = make(chosen.what.removeprefix("micro/"))
+        most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
+        recording = play(played, POLICIES[policy], chosen.seed, most_steps)
+    with Progress(console=console, transient=True) as bar:
+        drawing = bar.track(
+            render.frames(played, recording),
+            total=render.n_frames(recording),
+            description="drawing",
+        )
+        count = write_video(iter(drawing), out, render.FPS)
+    print(
+        f"{out}: {count} frames, {len(recording.returns)} steps of the {policy} policy, "
+        f"return {rounded(recording.returns[-1])}, {recording.verdict or 'not finished'}"
+    )
+
+
+def _render_run(chosen: Render, out: Path, seconds: float) -> None:
+    if chosen.policy is not None:
+        raise ConfigError(
+            f"--policy is for battles such as micro/2s3z, and {chosen.what} is the directory of a "
+            "run: leave it out, or choose one of the run's teams with --team."
+        )
     from rich.console import Console
     from rich.progress import Progress
 
@@ -48,15 +114,16 @@ def main(arguments: list[str]) -> None:
     from race.trained import load_trained
 
     use_cache()
+    team = chosen.team or "selected"
     with console.status("loading the team"):
-        trained = load_trained(chosen.run_dir)
-        policy = trained.policy(chosen.team)
-    episode = Episode(trained.task, policy, chosen.seed, chosen.seconds, renderer)
+        trained = load_trained(Path(chosen.what))
+        policy = trained.policy(team)
+    episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
     with Progress(console=console, transient=True) as bar:
         drawing = bar.track(episode.frames(), total=episode.n_frames, description="drawing")
-        count = write_video(iter(drawing), chosen.out, episode.fps)
-    name = {"marl": "MARL team", "champion": "champion"}[trained.resolve(chosen.team)]
+        count = write_video(iter(drawing), out, episode.fps)
+    name = {"marl": "MARL team", "champion": "champion"}[trained.resolve(team)]
     print(
-        f"{chosen.out}: {count} frames, {episode.steps} steps of the {name}, "
+        f"{out}: {count} frames, {episode.steps} steps of the {name}, "
         f"return {rounded(episode.episode_return)}"
     )

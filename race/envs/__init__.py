@@ -1,10 +1,11 @@
-"""Tasks: Multi-Agent MuJoCo, probes with known answers, and your own."""
+"""Tasks: Multi-Agent MuJoCo, micromanagement battles, probes with known answers, and your own."""
 
 import difflib
 import importlib
 import inspect
 import re
 import sys
+import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -15,9 +16,16 @@ import numpy as np
 from race.config import EnvConfig
 from race.envs import mamujoco, probe
 from race.errors import TaskError
-from race.types import EnvSpec, Task
+from race.types import DiscreteTask, EnvSpec, Task
 
-__all__ = ["TaskInfo", "describe_tasks", "factorised", "make_task", "task_ids"]
+__all__ = [
+    "TaskInfo",
+    "describe_tasks",
+    "factorised",
+    "make_discrete_task",
+    "make_task",
+    "task_ids",
+]
 
 _PAPER_NAMES: Final = {
     "mamujoco/HalfCheetah-2x3": "2-Agent HalfCheetah",
@@ -29,6 +37,7 @@ _PAPER_NAMES: Final = {
     "mamujoco/Humanoid-9x8": "2-Agent Humanoid",
     "mamujoco/HumanoidStandup-9x8": "2-Agent HumanoidStandup",
 }
+_MICRO: Final = "micro/"
 _DEFAULT: Final = EnvConfig()
 
 
@@ -41,11 +50,12 @@ class TaskInfo(NamedTuple):
 
 
 def describe_tasks() -> tuple[TaskInfo, ...]:
-    """All tasks that have a name: the paper's eight, other MuJoCo ones, then probes."""
+    """All tasks that have a name: the paper's sixteen, other MuJoCo ones, then probes."""
     known = [f"mamujoco/{s}-{p}" for s, ps in mamujoco.KNOWN_PARTITIONS.items() for p in ps]
     others = [name for name in known if name not in _PAPER_NAMES]
     return (
         *(TaskInfo(name, _describe(name), _PAPER_NAMES[name]) for name in _PAPER_NAMES),
+        *_describe_battles(),
         *(TaskInfo(name, _describe(name), None) for name in others),
         *(TaskInfo(name, info.description, None) for name, info in probe.PROBES.items()),
     )
@@ -72,6 +82,17 @@ def _describe(name: str) -> str:
     return f"{scenario}: {agents} agents, {each} {part}{'s' if each != '1' else ''} each"
 
 
+def _describe_battles() -> tuple[TaskInfo, ...]:
+    # Read here, because importing race.envs.micro imports jax, which takes longer than a listing.
+    folder = Path(__file__).parent / "micro" / "maps"
+    return tuple(
+        TaskInfo(
+            _MICRO + path.stem, tomllib.loads(path.read_text("utf-8"))["description"], path.stem
+        )
+        for path in sorted(folder.glob("*.toml"))
+    )
+
+
 def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
     """The task of an id.
 
@@ -83,8 +104,16 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
         config: what agents of Multi-Agent MuJoCo observe; its defaults, if not given.
 
     Raises:
-        TaskError: if there is no such task; the message names the nearest ones.
+        TaskError: if there is no such task; the message names the nearest ones. Also for
+            ``micro/...``, whose actions are discrete (`make_discrete_task`).
     """
+    if task_id.startswith(_MICRO):
+        make_discrete_task(task_id)  # which knows better what is wrong with an unknown map
+        raise TaskError(
+            f"Task {task_id} has discrete actions, and the learners matd3 and maddpg control "
+            f"continuous ones only, so it cannot be trained on yet. `race render {task_id}` shows "
+            f"a battle, and race.envs.make_discrete_task({task_id!r}) makes the environment."
+        )
     if re.fullmatch(r"[\w.]+:\w+", task_id):
         return _own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
@@ -95,6 +124,28 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
     raise TaskError(
         f"There is no task {task_id!r}. The nearest names are {', '.join(nearest)}; `race list` "
         "shows all, and a task of your own is named package.module:function."
+    )
+
+
+def make_discrete_task(task_id: str) -> DiscreteTask:
+    """The task with discrete actions of an id.
+
+    Args:
+        task_id: ``micro/<map>``, one of `task_ids`, or ``micro/<path>.toml`` for a map of your
+            own.
+
+    Raises:
+        TaskError: if there is no such map, its file is wrong, or the task is of another kind.
+    """
+    if task_id.startswith(_MICRO):
+        from race.envs.micro import environment  # imports jax
+
+        return environment.make_task(task_id)
+    battles = [info.id for info in _describe_battles()]
+    nearest = difflib.get_close_matches(task_id, battles, n=3, cutoff=0.0)
+    raise TaskError(
+        f"There is no task {task_id!r} with discrete actions. The nearest names are "
+        f"{', '.join(nearest)}; race.envs.make_task makes tasks with continuous actions."
     )
 
 

@@ -1,4 +1,5 @@
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pytest
 
 from race.config import EnvConfig
 from race.envs import describe_tasks, factorised, make_task, task_ids
+from race.envs.micro import load_map, map_names
 from race.errors import TaskError
 from race.presets import TABLE_3
 from race.rollouts.host import EnvPool, collect
@@ -34,8 +36,17 @@ def test_ids_are_unique_and_the_papers_come_first():
     ids = task_ids()
     assert len(set(ids)) == len(ids)
     assert set(ids[:8]) == set(TABLE_3)
+    assert ids[8:16] == tuple(f"micro/{name}" for name in map_names())
     named = {info.id for info in describe_tasks() if info.paper_name is not None}
-    assert named == set(TABLE_3)
+    assert named == set(ids[:16])
+
+
+def test_battles_are_described_without_importing_jax():
+    described = {info.id: info.description for info in describe_tasks()}
+    for name in map_names():
+        assert described[f"micro/{name}"] == load_map(name).description
+    check = "import sys, race.envs as e; e.describe_tasks(); sys.exit('jax' in sys.modules)"
+    subprocess.run([sys.executable, "-c", check], check=True)
 
 
 def test_nearest_names():

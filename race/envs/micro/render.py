@@ -17,7 +17,7 @@ from race.envs.micro.recording import Recording
 from race.envs.micro.state import Units
 from race.envs.micro.units import LOOPS_PER_SECOND, MAX_ENERGY, UNIT_TYPES, Mover
 
-FPS: Final = LOOPS_PER_SECOND
+FPS: Final = float(LOOPS_PER_SECOND)
 """Frames per second for playback at the game's "normal" speed: one frame is one game loop."""
 
 _ALLY: Final[Color] = (62, 124, 214)
