@@ -155,10 +155,13 @@ def absorb(
         armour: of each target against each hit.
         shield: of each target before the hits.
     """
-    order = jnp.arange(hits.shape[0])
-    earlier = (order[:, None] > order[None]).astype(hits.dtype) @ hits
-    rest = jnp.clip(earlier + hits - shield[None], 0.0, hits)
-    return jnp.sum(jnp.where(rest > 0, jnp.maximum(rest - armour, LEAST_DAMAGE), 0.0), axis=0)
+    loss = jnp.zeros_like(shield)
+    armour = jnp.broadcast_to(armour, hits.shape)
+    for k in range(hits.shape[0]):
+        rest = jnp.maximum(hits[k] - shield, 0.0)
+        shield = jnp.maximum(shield - hits[k], 0.0)
+        loss += jnp.where(rest > 0, jnp.maximum(rest - armour[k], LEAST_DAMAGE), 0.0)
+    return loss
 
 
 def _take(

@@ -92,11 +92,16 @@ def _pushes(
     # The dead are put out of everyone's way.
     x = jnp.where(units.health > 0, units.x + vx, 1000.0 + 10.0 * everyone.astype(jnp.float32))
     y = units.y + vy
-    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-    near = jax.lax.rsqrt(jnp.maximum(dx * dx + dy * dy, 1e-6))
-    overlap = jnp.maximum(scenario.contact * near - 1.0, 0.0) * scenario.stiffness
     with_friends = jnp.where(footing.fights, 0.5, 0.0)
     with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
+    # Without the barrier the compiler works these out again for every pair of units.
+    x, y, with_friends, with_enemies = jax.lax.optimization_barrier(
+        (x, y, with_friends, with_enemies)
+    )
+    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
+    # (c^2 - d^2) / 2d is the overlap c - d near contact, and more where it is deep.
+    square = jnp.maximum(dx * dx + dy * dy, 1e-3)
+    overlap = jnp.maximum(scenario.contact / square - 1.0, 0.0) * scenario.stiffness
     side = everyone < n
     same = side[:, None] == side[None]
     share = 0.5 + jnp.where(

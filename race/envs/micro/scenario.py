@@ -145,8 +145,9 @@ class Scenario:
 
     # Crowding.
     contact: Float[Any, "U U"]
-    """Centre distance at which two units touch; 0 if they pass each other."""
+    """Square of the centre distance at which two units touch; 0 if they pass each other."""
     stiffness: Float[Any, "U U"]
+    """Half the share of an overlap that is undone in a game loop."""
 
     # SMAC's features.
     cooldown_scale: Float[Any, "n"]
@@ -370,7 +371,7 @@ def _contacts(types: list[UnitType]) -> tuple[NDArray[np.float32], NDArray[np.fl
             if i != j and _collide(one, other):
                 both_fly = one.mover is Mover.AIR
                 stiffness[i, j] = AIR_STIFFNESS if both_fly else STIFFNESS
-    return _f(np.where(stiffness > 0, contact, 0.0)), _f(stiffness)
+    return _f(np.where(stiffness > 0, np.square(contact), 0.0)), _f(stiffness / 2)
 
 
 def _collide(one: UnitType, other: UnitType) -> bool:
