@@ -23,20 +23,34 @@ class Render:
 
     what: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="DIR|micro/MAP")]
     """The directory of a run, or a battle."""
-    out: Path | None = None
-    """The video: .mp4 or .gif. Default: team.mp4 of a run, battle.gif of a battle."""
-    team: TeamName | None = None
-    """Of a run: the gradient learner's team (marl), the population's team of best training
-    fitness (champion), or of these two the one with the better training return (selected, the
-    default)."""
-    policy: PolicyName | None = None
-    """Of a battle: all agents attack the weakest enemy in reach (scripted, the default), or do
-    anything that is allowed (random)."""
+    out: Annotated[
+        Path | None,
+        tyro.conf.arg(
+            metavar="PATH",
+            help_behavior_hint="(default: team.mp4 of a run, battle.gif of a battle)",
+        ),
+    ] = None
+    """The video: .mp4 or .gif."""
+    team: Annotated[
+        TeamName | None,
+        tyro.conf.arg(metavar="{marl,champion,selected}", help_behavior_hint="(default: selected)"),
+    ] = None
+    """For a run: the gradient learner's team, the population's team of best training fitness, or
+    of these two the one with the better training return."""
+    policy: Annotated[
+        PolicyName | None,
+        tyro.conf.arg(metavar="{scripted,random}", help_behavior_hint="(default: scripted)"),
+    ] = None
+    """For a battle: all attack the weakest enemy in reach, or do anything that is available."""
     seed: int = 0
     """Seed of the episode."""
-    seconds: float | None = None
-    """Simulated time to show; 0 for the whole episode. Default: 15 of a run, the whole of a
-    battle."""
+    seconds: Annotated[
+        float | None,
+        tyro.conf.arg(
+            metavar="FLOAT", help_behavior_hint="(default: 15 of a run, the whole of a battle)"
+        ),
+    ] = None
+    """Simulated time to show; 0 for the whole episode."""
 
 
 def main(arguments: list[str]) -> None:
