@@ -8,7 +8,10 @@ import jax
 
 
 class Measurement(NamedTuple):
-    """A number with its unit and, where there is one, the value it should not exceed."""
+    """A number with its unit and, where there is one, the value that is good enough.
+
+    Rates, whose unit is ``1/s``, should reach their goal; all else should not exceed it.
+    """
 
     name: str
     value: float
@@ -18,7 +21,14 @@ class Measurement(NamedTuple):
     @property
     def met(self) -> bool | None:
         """Whether the goal is met; None without a goal."""
-        return None if self.goal is None else self.value <= self.goal
+        if self.goal is None:
+            return None
+        return self.value >= self.goal if self.is_rate else self.value <= self.goal
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether more is better."""
+        return self.unit == "1/s"
 
     def to_json(self) -> dict[str, Any]:
         """Plain JSON values: ``name, value, unit, goal, met``."""

@@ -51,7 +51,8 @@ def main(arguments: list[str]) -> None:
     for column in table.columns:
         column.no_wrap = True
     for result in results:
-        goal = "" if result.goal is None else f"<= {result.goal:g}"
+        sign = ">=" if result.is_rate else "<="
+        goal = "" if result.goal is None else f"{sign} {result.goal:,g}"
         verdict = {None: "", True: "met", False: "not met"}[result.met]
         value = f"{result.value:,.0f}" if result.value >= 1000 else f"{result.value:.3g}"
         table.add_row(result.name, f"{value} {result.unit}", goal, verdict)

@@ -1,0 +1,92 @@
+"""Environment steps per second of the micromanagement battles, with random available actions.
+
+A step is the whole step: drawing the actions, eight game loops, observations, state, masks, reward,
+and a new battle where one has ended. Everything runs in one compiled scan.
+"""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Key
+
+from race.bench.measurement import Measurement, Subject, interleaved_best
+from race.envs.micro import Battle, make, map_names, smac
+from race.envs.micro.policies import random_actions
+
+GOALS: Final[dict[str, dict[int, float]]] = {
+    "2s3z": {1: 20_000, 6: 40_000, 256: 60_000},
+    "MMM2": {1: 6_000, 6: 12_000, 256: 20_000},
+    "2c_vs_64zg": {1: 1_500, 6: 3_000, 256: 5_000},
+}
+"""Steps per second of so many battles at once, all battles together, on two cores."""
+BATTLES: Final = (1, 6, 256)
+COMPILE_GOAL: Final = 15.0
+"""Seconds to compile a map's program."""
+STEPS: Final = {1: 2000, 6: 600, 256: 24}
+"""Steps of each battle in one measurement."""
+ROUNDS: Final = 5
+
+
+def subjects() -> list[Subject]:
+    """The eight maps."""
+    return [Subject(_names(name), partial(measure, name)) for name in map_names()]
+
+
+def _names(name: str) -> tuple[str, ...]:
+    rates = (f"micro/{name}/battles_{battles}/steps_per_second" for battles in BATTLES)
+    return (*rates, f"micro/{name}/compile")
+
+
+def measure(name: str) -> list[Measurement]:
+    """Speeds and compile time of a map."""
+    battle = make(name)
+    runs: list[Callable[[], Any]] = []
+    compile_times = []
+    for battles in BATTLES:
+        key = jax.random.key(0)
+        begin = time.perf_counter()
+        run = jax.jit(partial(_play, battle, battles)).lower(key).compile()
+        compile_times.append(time.perf_counter() - begin)
+        runs.append(partial(run, key))
+    *rate_names, compile_name = _names(name)
+    rates = [
+        Measurement(
+            rate_name,
+            battles * STEPS[battles] / seconds,
+            "1/s",
+            GOALS.get(name, {}).get(battles),
+        )
+        for rate_name, battles, seconds in zip(
+            rate_names, BATTLES, interleaved_best(runs, ROUNDS), strict=True
+        )
+    ]
+    return [*rates, Measurement(compile_name, max(compile_times), "s", COMPILE_GOAL)]
+
+
+def _play(battle: Battle, battles: int, key: Key[Array, ""]) -> Any:
+    """Sums over all that the steps return, so that nothing of them is left out."""
+
+    def one(key: Key[Array, ""]) -> Any:
+        fresh = smac.reset(battle.scenario, key)
+
+        def step(carry: Any, key: Key[Array, ""]) -> Any:
+            env_state, observation = carry
+            act_key, step_key = jax.random.split(key)
+            actions = random_actions(battle.scenario, env_state, observation, act_key)
+            env_state, timestep = smac.step(battle.scenario, env_state, actions, step_key)
+            seen = timestep.observation
+            total = jnp.sum(seen.obs) + jnp.sum(seen.state) + timestep.reward
+            carry = jax.tree.map(
+                lambda new, now: jnp.where(timestep.terminated, new, now),
+                fresh,
+                (env_state, timestep.observation),
+            )
+            return carry, (total, timestep.info)
+
+        return jax.lax.scan(step, fresh, jax.random.split(key, STEPS[battles]))
+
+    return one(key) if battles == 1 else jax.vmap(one)(jax.random.split(key, battles))
