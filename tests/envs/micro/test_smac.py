@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -337,7 +337,7 @@ def compare(name: str, seed: int) -> set[str]:
 def test_agrees_with_a_second_version(name: str) -> None:
     kinds: set[str] = set()
 
-    @settings(max_examples=5, derandomize=True, deadline=None, database=None)
+    @settings(max_examples=5, derandomize=True, deadline=None, phases=[Phase.generate])
     @given(st.integers(0, 2**32 - 1))
     def run(seed: int) -> None:
         kinds.update(compare(name, seed))
@@ -348,7 +348,7 @@ def test_agrees_with_a_second_version(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", map_names())
-@settings(max_examples=200, derandomize=True, deadline=None)
+@settings(max_examples=200, derandomize=True, deadline=None, phases=[Phase.generate])
 @given(st.integers(0, 2**32 - 1))
 def test_agrees_with_a_second_version_at_length(name: str, seed: int) -> None:
     compare(name, seed)
@@ -500,7 +500,7 @@ def columns(env_state: Any) -> Columns:
     return {field: np.array(getattr(env_state.units, field)) for field in smac.View._fields}
 
 
-@pytest.mark.parametrize("name", ["2s3z", "MMM"])
+@pytest.mark.parametrize("name", ["MMM"])
 def test_steps_show_what_the_second_version_makes_of_the_units(name: str) -> None:
     battle, theirs = make(name), Smac(name)
     rng = np.random.default_rng(0)
