@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from race.envs.micro.maps import CLIFF, WALL, MapSpec
+from race.envs.micro.maps import MapSpec
+from race.envs.micro.units import CLIFF, WALL
 
 Color = tuple[int, int, int]
 Point = tuple[float, float]

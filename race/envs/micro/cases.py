@@ -42,7 +42,7 @@ def main(arguments: list[str] | None = None) -> int:
     for path in chosen.files:
         try:
             worst = compare(json.loads(path.read_text(encoding="utf-8")))
-        except (OSError, ValueError, KeyError, TypeError, IndexError, RaceError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RaceError) as error:
             what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
             print(f"{path}: no usable cases: {what}", file=sys.stderr)
             return 2

@@ -57,6 +57,7 @@ def _sizes(task_id: str, spec: MapSpec) -> DiscreteSpec:
         enemy_bursts=False,
         flyers=False,
         plain=True,
+        ground=0,
         width=spec.cells.shape[0],
         height=spec.cells.shape[1],
         ally_heals=False,

@@ -30,7 +30,6 @@ type to observations and state; SMAC has them where a side has several types.
 """
 
 import difflib
-import math
 import re
 import tomllib
 from dataclasses import dataclass
@@ -41,16 +40,18 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from race.envs.micro.units import UNIT_TYPES, Mover, UnitType
+from race.envs.micro.lattice import Group, Start, place
+from race.envs.micro.units import GROUND, UNIT_TYPES
 from race.errors import TaskError
 
 OrderKind = Literal["attack_move", "attack_nearest", "hold"]
 
-GROUND: Final = "."
-WALL: Final = "#"
-CLIFF: Final = "C"
 PLAIN: Final = (GROUND * 32,) * 32
 
+_MOST: Final = 256
+"""Cells of a map's longer side."""
+_FAR: Final = 1e6
+_MOST_STEPS: Final = 1_000_000
 _FOLDER: Final = Path(__file__).parent / "maps"
 _KEYS: Final = {
     "description",
@@ -62,23 +63,6 @@ _KEYS: Final = {
     "enemy_order",
     "terrain",
 }
-
-
-class Start(NamedTuple):
-    """A unit at the start: its type and the place of its centre."""
-
-    unit: str
-    x: float
-    y: float
-
-
-class Group(NamedTuple):
-    """Units created together round a point."""
-
-    unit: str
-    size: int
-    x: float
-    y: float
 
 
 class EnemyOrder(NamedTuple):
@@ -128,13 +112,13 @@ class MapSpec:
     @cached_property
     def allies(self) -> tuple[Start, ...]:
         """The agents at the start, in SMAC's order: by type, then x, then y."""
-        starts = _place(self, self.ally_groups)
+        starts = place(self.cells, self.name, self.ally_groups)
         return tuple(sorted(starts, key=lambda s: (UNIT_TYPES[s.unit].rank, s.x, s.y)))
 
     @cached_property
     def enemies(self) -> tuple[Start, ...]:
         """The enemies at the start, in the order of creation."""
-        return _place(self, self.enemy_groups)
+        return place(self.cells, self.name, self.enemy_groups)
 
 
 def map_names() -> tuple[str, ...]:
@@ -175,12 +159,7 @@ def parse_map(name: str, text: str) -> MapSpec:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise TaskError(f"Map {name} is not valid TOML: {error}.") from error
-    unknown = sorted(set(table) - _KEYS)
-    if unknown:
-        raise TaskError(
-            f"Map {name} has the unknown entry {unknown[0]!r}; there may be "
-            f"{', '.join(sorted(_KEYS))}."
-        )
+    _table(name, "the map", table, _KEYS)
     spec = MapSpec(
         name=name,
         description=_entry(name, table, "description", str),
@@ -196,9 +175,21 @@ def parse_map(name: str, text: str) -> MapSpec:
     return spec
 
 
+def _table(name: str, what: str, value: Any, keys: set[str]) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise TaskError(f"Map {name}: {what} must be a table, and is {value!r}.")
+    for key in value:
+        if key not in keys:
+            raise TaskError(
+                f"Map {name}: {what} has the unknown entry {key!r}; there may be "
+                f"{', '.join(sorted(keys))}."
+            )
+    return value
+
+
 def _entry(name: str, table: dict[str, Any], key: str, kind: type) -> Any:
     value = table.get(key)
-    if key not in table or not isinstance(value, kind) or isinstance(value, bool):
+    if not isinstance(value, kind) or isinstance(value, bool):
         raise TaskError(
             f"Map {name} needs the entry {key!r} of type {kind.__name__}; it has {value!r}."
         )
@@ -210,7 +201,7 @@ def _point(name: str, table: dict[str, Any], key: str) -> tuple[float, float]:
     if (
         not isinstance(value, list)
         or len(value) != 2
-        or not all(type(v) in (int, float) and math.isfinite(v) for v in value)
+        or not all(type(v) in (int, float) and abs(v) <= _FAR for v in value)
     ):
         raise TaskError(f"Map {name}: {key!r} must be a point [x, y], and is {value!r}.")
     return float(value[0]), float(value[1])
@@ -218,7 +209,8 @@ def _point(name: str, table: dict[str, Any], key: str) -> tuple[float, float]:
 
 def _groups(name: str, table: dict[str, Any], key: str) -> tuple[Group, ...]:
     groups = []
-    for group in _entry(name, table, key, list):
+    for value in _entry(name, table, key, list):
+        group = _table(name, f"each group of {key}", value, {"unit", "count", "at"})
         unit = _entry(name, group, "unit", str)
         if unit not in UNIT_TYPES:
             raise TaskError(
@@ -235,14 +227,14 @@ def _groups(name: str, table: dict[str, Any], key: str) -> tuple[Group, ...]:
 
 def _columns(name: str, table: dict[str, Any], key: str) -> tuple[str, ...]:
     value = table.get(key, [])
-    if not isinstance(value, list) or not all(v in UNIT_TYPES for v in value):
+    if not isinstance(value, list) or not all(v in list(UNIT_TYPES) for v in value):
         raise TaskError(f"Map {name}: {key!r} must be a list of unit types, and is {value!r}.")
     return tuple(value)
 
 
 def _order(name: str, table: dict[str, Any]) -> EnemyOrder:
-    order = _entry(name, table, "enemy_order", dict)
-    kind = order.get("kind")
+    order = _table(name, "'enemy_order'", table.get("enemy_order"), {"kind", "to"})
+    kind: Any = order.get("kind")
     if kind not in get_args(OrderKind):
         raise TaskError(
             f"Map {name}: kind of enemy_order must be one of {', '.join(get_args(OrderKind))}, and "
@@ -254,18 +246,24 @@ def _order(name: str, table: dict[str, Any]) -> EnemyOrder:
 def _rows(name: str, table: dict[str, Any]) -> tuple[str, ...]:
     if "terrain" not in table:
         return PLAIN
-    rows = tuple(_entry(name, _entry(name, table, "terrain", dict), "cells", str).split())
+    terrain = _table(name, "'terrain'", table["terrain"], {"cells"})
+    rows = tuple(_entry(name, terrain, "cells", str).split())
     if len({len(row) for row in rows}) != 1 or not re.fullmatch(r"[.#C]+", "".join(rows)):
         raise TaskError(
             f"Map {name}: cells of the terrain must be lines of equal length out of '.', '#', 'C'."
         )
+    if max(len(rows), len(rows[0])) > _MOST:
+        raise TaskError(f"Map {name}: the terrain must not be longer than {_MOST} cells.")
     return rows
 
 
 def _check(spec: MapSpec) -> None:
     name = spec.name
-    if spec.episode_limit < 1:
-        raise TaskError(f"Map {name}: episode_limit must be at least 1.")
+    if not 1 <= spec.episode_limit <= _MOST_STEPS:
+        raise TaskError(
+            f"Map {name}: episode_limit must be from 1 to {_MOST_STEPS}, and is "
+            f"{spec.episode_limit}."
+        )
     if len(spec.ally_type_columns) != len(spec.enemy_type_columns):
         raise TaskError(
             f"Map {name}: ally_type_columns and enemy_type_columns must have the same length."
@@ -283,57 +281,10 @@ def _check(spec: MapSpec) -> None:
             f"Map {name}: an allied healer needs an action for each of the {n_allies} allies, and "
             f"SMAC's actions offer one per enemy, {n_enemies}."
         )
-
-
-# SMAC's maps create a group on a square lattice through its point.
-
-
-def _place(spec: MapSpec, groups: tuple[Group, ...]) -> tuple[Start, ...]:
-    placed: list[Start] = []
-    for group in groups:
-        unit = UNIT_TYPES[group.unit]
-        x, y = group.x, group.y
-        if "structure" in unit.attributes:  # its 2 x 2 footprint snaps to the grid
-            x, y = float(round(x)), float(round(y))
-        step = 2 * unit.radius
-        found = 0
-        for i, j in _lattice(int(max(spec.cells.shape) / step) + 1):
-            start = Start(group.unit, x + i * step, y + j * step)
-            if _fits(spec, unit, start, placed):
-                placed.append(start)
-                found += 1
-            if found == group.size:
-                break
-        else:
-            raise TaskError(
-                f"Map {spec.name}: there is room for only {found} of {group.size} {group.unit} "
-                f"round ({group.x:g}, {group.y:g})."
-            )
-    return tuple(placed)
-
-
-def _lattice(reach: int) -> list[tuple[int, int]]:
-    """Points of the lattice by distance, at equal distance counter-clockwise from the south."""
-    points = [(i, j) for i in range(-reach, reach + 1) for j in range(-reach, reach + 1)]
-
-    def order(point: tuple[int, int]) -> tuple[int, float]:
-        i, j = point
-        return i * i + j * j, math.atan2(i, -j) % (2 * math.pi)
-
-    return sorted(points, key=order)
-
-
-def _fits(spec: MapSpec, unit: UnitType, start: Start, placed: list[Start]) -> bool:
-    x, y = math.floor(start.x), math.floor(start.y)
     width, height = spec.cells.shape
-    if not (0 <= x < width and 0 <= y < height):
-        return False
-    flies = unit.mover is Mover.AIR
-    if not flies and spec.cells[x, y] != GROUND:
-        return False
-    return all(
-        math.hypot(start.x - other.x, start.y - other.y)
-        >= unit.radius + UNIT_TYPES[other.unit].radius - 1e-6
-        for other in placed
-        if (UNIT_TYPES[other.unit].mover is Mover.AIR) == flies
-    )
+    order = spec.enemy_order
+    if not (0 <= order.x < width and 0 <= order.y < height):
+        raise TaskError(
+            f"Map {name}: 'to' of 'enemy_order' is ({order.x:g}, {order.y:g}), beyond the "
+            f"map of {width} x {height} cells."
+        )

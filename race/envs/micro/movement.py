@@ -10,8 +10,6 @@ from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import Units
 from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
 
-MOST_PUSHED: Final = 0.25
-"""How far others can push a unit in a game loop, in cells."""
 SWERVE: Final = 1.0
 """Share of a push that also turns the unit aside, so that it finds its way round others."""
 
@@ -37,14 +35,32 @@ class Footing(NamedTuple):
 def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> Units:
     """One game loop of walking: own steps, then others' pushes, then walls."""
     alive = units.health > 0
+    vx, vy = _own_step(scenario, units, course)
+    vx, vy = jnp.where(alive, vx, 0.0), jnp.where(alive, vy, 0.0)
+    push_x, push_y = _pushes(scenario, units, vx, vy, footing)
+    pushed = (push_x != 0) | (push_y != 0)
+    dx, dy = vx + push_x, vy + push_y
+    # Half of the last loop's step goes on in a crowd; without it units tremble between others.
+    dx = jnp.where(pushed, 0.5 * (dx + units.vx), dx)
+    dy = jnp.where(pushed, 0.5 * (dy + units.vy), dy)
+    length = jnp.sqrt(dx * dx + dy * dy)
+    share = jnp.where(alive, jnp.minimum(1.0, scenario.speed / jnp.maximum(length, 1e-6)), 0.0)
+    x, y = _stop_at_walls(scenario, units, units.x + dx * share, units.y + dy * share)
+    x, y = jnp.where(alive, x, units.x), jnp.where(alive, y, units.y)
+    return units._replace(x=x, y=y, vx=x - units.x, vy=y - units.y)
+
+
+def _own_step(
+    scenario: Scenario, units: Units, course: Course
+) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
     x, y = _way(scenario, units, course)
     dx, dy = x - units.x, y - units.y
     length = jnp.sqrt(dx * dx + dy * dy)
-    step = jnp.where(alive, jnp.minimum(scenario.speed, jnp.maximum(course.distance, 0.0)), 0.0)
+    distance = jnp.maximum(course.distance, 0.0)
+    step = jnp.minimum(scenario.speed, distance)
     if scenario.shape.flyers:
         # Units that take time to slow down begin to do so in time.
-        braking = jnp.sqrt(2 * scenario.acceleration * jnp.maximum(course.distance, 0.0))
-        step = jnp.minimum(step, braking)
+        step = jnp.minimum(step, jnp.sqrt(2 * scenario.acceleration * distance))
     share = step / jnp.maximum(length, 1e-6)
     vx, vy = dx * share, dy * share
     if scenario.shape.flyers:
@@ -52,11 +68,7 @@ def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> 
         change = jnp.sqrt(change_x * change_x + change_y * change_y)
         share = jnp.minimum(1.0, scenario.acceleration / jnp.maximum(change, 1e-6))
         vx, vy = units.vx + change_x * share, units.vy + change_y * share
-        units = units._replace(vx=jnp.where(alive, vx, 0.0), vy=jnp.where(alive, vy, 0.0))
-    vx, vy = jnp.where(alive, vx, 0.0), jnp.where(alive, vy, 0.0)
-    push_x, push_y = _pushes(scenario, units, vx, vy, footing)
-    new_x, new_y = _stop_at_walls(scenario, units, units.x + vx + push_x, units.y + vy + push_y)
-    return units._replace(x=jnp.where(alive, new_x, units.x), y=jnp.where(alive, new_y, units.y))
+    return vx, vy
 
 
 def _way(
@@ -66,7 +78,10 @@ def _way(
     if scenario.shape.plain:
         return course.x, course.y
     mover = scenario.mover
-    goal = scenario.node[mover, _cell(course.x), _cell(course.y)]
+    # A move order may lead beyond the rim.
+    column = jnp.clip(_cell(course.x), 0, scenario.shape.width - 1)
+    row = jnp.clip(_cell(course.y), 0, scenario.shape.height - 1)
+    goal = scenario.node[mover, column, row]
     here = scenario.node[mover, _cell(units.x), _cell(units.y)]
     corner = scenario.ways[mover, here, goal]
     centre = scenario.centre[mover, corner]
@@ -112,14 +127,11 @@ def _pushes(
     weight = overlap * share
     push_x, push_y = jnp.sum(weight * dx, axis=1), jnp.sum(weight * dy, axis=1)
     turn = jnp.where(footing.fights | footing.idle, 0.0, SWERVE)
-    # To the side that also brings it on.
-    turn = jnp.where(vy * push_x - vx * push_y >= 0, turn, -turn)
-    push_x, push_y = push_x - turn * push_y, push_y + turn * push_x
-    length = jnp.sqrt(push_x * push_x + push_y * push_y)
-    share = jnp.where(
-        scenario.speed > 0, jnp.minimum(1.0, MOST_PUSHED / jnp.maximum(length, 1e-6)), 0.0
-    )
-    return push_x * share, push_y * share
+    # On to the side on which it already goes round, or else to the one that brings it on.
+    onwards = units.vy * push_x - units.vx * push_y
+    onwards = jnp.where(onwards == 0, vy * push_x - vx * push_y, onwards)
+    turn = jnp.where(onwards >= 0, turn, -turn)
+    return push_x - turn * push_y, push_y + turn * push_x
 
 
 def _stop_at_walls(

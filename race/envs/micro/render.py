@@ -12,10 +12,10 @@ from race.envs.micro import Battle
 from race.envs.micro.battle import LOOPS_PER_STEP
 from race.envs.micro.canvas import WHITE, Canvas, Color, Pen, Point, Window, mixed
 from race.envs.micro.combat import BEAM_HALF_LENGTH
-from race.envs.micro.maps import WALL, MapSpec
+from race.envs.micro.maps import MapSpec
 from race.envs.micro.recording import Recording
 from race.envs.micro.state import Units
-from race.envs.micro.units import LOOPS_PER_SECOND, MAX_ENERGY, UNIT_TYPES, Mover
+from race.envs.micro.units import LOOPS_PER_SECOND, MAX_ENERGY, UNIT_TYPES, WALL, Mover
 
 FPS: Final = float(LOOPS_PER_SECOND)
 """Frames per second for playback at the game's "normal" speed: one frame is one game loop."""

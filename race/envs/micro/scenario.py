@@ -54,6 +54,8 @@ class Shape:
     """Whether the ground of every unit is one rectangle."""
     width: int
     height: int
+    ground: int
+    """Length of the tables of ways; 0 on a plain map."""
     ally_heals: bool
     """Whether agents have healers, whose actions name agents."""
 
@@ -190,7 +192,7 @@ def _build(spec: MapSpec) -> Scenario:
     goals = _goals(spec, places)
     structure = [0.0 if "structure" in t.attributes else 1.0 for t in types]
     return Scenario(
-        shape=_shape(spec, types, n, plain=ground.plain),
+        shape=_shape(spec, types, n, ground),
         x=_f([s.x for s in starts]),
         y=_f([s.y for s in starts]),
         max_health=_f([t.health for t in types]),
@@ -264,7 +266,7 @@ def _loops(seconds: list[float]) -> Any:
     return _f(np.array(seconds) * LOOPS_PER_SECOND)
 
 
-def _shape(spec: MapSpec, types: list[UnitType], n: int, *, plain: bool) -> Shape:
+def _shape(spec: MapSpec, types: list[UnitType], n: int, ground: Terrain) -> Shape:
     weapons = [t.weapon or _UNARMED for t in types]
     return Shape(
         n_allies=n,
@@ -277,7 +279,8 @@ def _shape(spec: MapSpec, types: list[UnitType], n: int, *, plain: bool) -> Shap
         ally_bursts=any(w.burst for w in weapons[:n]),
         enemy_bursts=any(w.burst for w in weapons[n:]),
         flyers=any(t.mover is Mover.AIR for t in types),
-        plain=plain,
+        plain=ground.plain,
+        ground=ground.ways.shape[1],
         width=spec.cells.shape[0],
         height=spec.cells.shape[1],
         ally_heals=any(t.heals for t in types[:n]),

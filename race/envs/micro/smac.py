@@ -21,8 +21,8 @@ SIGHT: Final = 9.0
 """Agents see units nearer than this, centre to centre, whatever their type."""
 SHOOT: Final = 6.0
 """Agents may attack or heal units no further than this, centre to centre."""
-PROBE: Final = 1.0
-"""How far ahead a move looks for ground: half of what it asks for."""
+PROBE: Final = 1
+"""How far ahead a move looks for ground, in cells: half of what it asks for."""
 
 
 class View(NamedTuple):
@@ -101,13 +101,13 @@ def step(
         last_actions=taken,
         over=env_state.over,
     )
-    reward, terminated, info = judge(scenario, before, view(after.units), after.steps)
-    after = after._replace(over=terminated)
     over = env_state.over
     after = jax.tree.map(lambda old, new: jnp.where(over, old, new), env_state, after)
+    reward, terminated, info = judge(scenario, before, view(after.units), after.steps)
+    after = after._replace(over=terminated)
     observation = observe(scenario, view(after.units), after.last_actions)
     info = info._replace(refused=~legal)
-    return after, Timestep(observation, jnp.where(over, 0.0, reward), after.over, info)
+    return after, Timestep(observation, jnp.where(over, 0.0, reward), terminated, info)
 
 
 def avail_actions(scenario: Scenario, units: View) -> Bool[Any, "n A"]:
@@ -120,19 +120,26 @@ def avail_actions(scenario: Scenario, units: View) -> Bool[Any, "n A"]:
     shape = scenario.shape
     n, width, height = shape.n_allies, shape.width, shape.height
     x, y, alive = units.x[:n], units.y[:n], units.health > 0
+    column, row = jnp.floor(x).astype(jnp.int32), jnp.floor(y).astype(jnp.int32)
 
-    def open_ground(x: Float[Any, "n"], y: Float[Any, "n"]) -> Bool[Any, "n"]:
-        column, row = jnp.trunc(x).astype(jnp.int32), jnp.trunc(y).astype(jnp.int32)
+    def ahead(place: Float[Any, "n"]) -> Int[Any, "n"]:
+        return jnp.floor(place).astype(jnp.int32) + PROBE
+
+    def behind(place: Float[Any, "n"]) -> Int[Any, "n"]:
+        cell = jnp.floor(place).astype(jnp.int32) - PROBE
+        return jnp.where((place > 0) & (place < PROBE), 0, cell)
+
+    def open_ground(column: Int[Any, "n"], row: Int[Any, "n"]) -> Bool[Any, "n"]:
         inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
         clipped = jnp.clip(column, 0, width - 1), jnp.clip(row, 0, height - 1)
         return inside & scenario.walkable[clipped]
 
     moves = jnp.stack(
         [
-            open_ground(x, y + PROBE),
-            open_ground(x, y - PROBE),
-            open_ground(x + PROBE, y),
-            open_ground(x - PROBE, y),
+            open_ground(column, ahead(y)),
+            open_ground(column, behind(y)),
+            open_ground(ahead(x), row),
+            open_ground(behind(x), row),
         ],
         axis=1,
     )
@@ -184,8 +191,9 @@ def observations(scenario: Scenario, units: View, available: Bool[Any, "n A"]) -
     ) -> Float[Any, "n others _"]:
         dx = units.x[None, part] - units.x[:n, None]
         dy = units.y[None, part] - units.y[:n, None]
-        distance = jnp.sqrt(dx * dx + dy * dy)
-        sees = (distance < SIGHT) & alive[None, part] & alive[:n, None]
+        square = dx * dx + dy * dy
+        distance = jnp.sqrt(square)
+        sees = (square < SIGHT**2) & alive[None, part] & alive[:n, None]
         seen = jnp.concatenate(
             [
                 jnp.stack([first, distance / SIGHT, dx / SIGHT, dy / SIGHT], axis=-1),

@@ -20,7 +20,7 @@ class Units(NamedTuple):
     x: Float[Any, "U"]
     y: Float[Any, "U"]
     vx: Float[Any, "U"]
-    """Velocity in cells per game loop; kept for units that need time to speed up."""
+    """Velocity: the step of the last game loop."""
     vy: Float[Any, "U"]
     health: Float[Any, "U"]
     shield: Float[Any, "U"]
@@ -60,7 +60,7 @@ def start(scenario: Scenario) -> EnvState:
     """The start of a battle. There is no chance in it: every battle begins the same."""
     shape = scenario.shape
     zeros = jnp.zeros(shape.n_units)
-    nobody = jnp.full(shape.n_units, NOBODY)
+    nobody = jnp.full(shape.n_units, NOBODY, jnp.int32)
     units = Units(
         x=scenario.x,
         y=scenario.y,
@@ -75,10 +75,13 @@ def start(scenario: Scenario) -> EnvState:
         aiming=zeros,
         pending=zeros,
         struck=nobody,
-        struck_by=jnp.full(shape.n_enemies, NOBODY),
+        struck_by=jnp.full(shape.n_enemies, NOBODY, jnp.int32),
         burst=zeros > 0,
         beam=jnp.zeros((shape.n_beams, 4)),
     )
     return EnvState(
-        units, jnp.zeros((), int), jnp.full(shape.n_allies, NOBODY), jnp.zeros((), bool)
+        units,
+        steps=jnp.zeros((), jnp.int32),
+        last_actions=jnp.full(shape.n_allies, NOBODY, jnp.int32),
+        over=jnp.zeros((), jnp.bool_),
     )

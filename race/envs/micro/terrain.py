@@ -4,14 +4,14 @@ All of it is worked out once per map, in numpy. Units then look up two tables: t
 their cell, and the next cell to head for on the way to another.
 """
 
+import math
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
-from race.envs.micro.maps import CLIFF, GROUND
-from race.envs.micro.units import Mover
+from race.envs.micro.units import CLIFF, GROUND, Mover
 
 EAST, WEST, NORTH, SOUTH = 1, 2, 4, 8
 """Bits of `Terrain.walls`."""
@@ -19,6 +19,8 @@ EAST, WEST, NORTH, SOUTH = 1, 2, 4, 8
 CLEARANCE: Final = 0.45
 """How far ways keep from walls: less than half a cell, so that the middle of any cell will do."""
 _SAMPLES_PER_CELL: Final = 4
+_ROUND: Final = 128
+"""Tables are as long as a multiple of this, so that maps of similar size share their programs."""
 
 
 class Terrain(NamedTuple):
@@ -61,7 +63,8 @@ def survey(cells: NDArray[Any], movers: tuple[Mover, ...], starts: NDArray[np.fl
         for mover, ground in zip(Mover, grounds, strict=True)
     ]
     walled = [m for m in movers if m is not Mover.AIR and not _is_rectangle(areas[m])]
-    size = max((int(areas[m].sum()) for m in walled), default=0)
+    most = max((int(areas[m].sum()) for m in walled), default=0)
+    size = math.ceil(most / _ROUND) * _ROUND
     node = np.zeros((len(Mover), *cells.shape) if walled else (len(Mover), 0, 0), np.int32)
     ways = np.zeros((len(Mover), size, size), np.int32)
     centre = np.zeros((len(Mover), size, 2), np.float32)
@@ -101,7 +104,7 @@ def _walls(enterable: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 
 def _bounds(area: NDArray[np.bool_]) -> NDArray[np.float32]:
-    x, y = np.nonzero(area)
+    x, y = np.nonzero(area if area.any() else np.ones_like(area))
     return np.array([x.min(), x.max() + 1, y.min(), y.max() + 1], np.float32)
 
 

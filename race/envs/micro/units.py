@@ -12,6 +12,13 @@ from typing import Final
 LOOPS_PER_SECOND: Final = 16
 
 
+GROUND: Final = "."
+WALL: Final = "#"
+"""A wall or a pit."""
+CLIFF: Final = "C"
+"""A cliff between two levels of ground."""
+
+
 class Mover(enum.IntEnum):
     """How a unit gets about."""
 

@@ -216,19 +216,23 @@ def test_absorb_pays_armour_once_per_hit_and_only_behind_the_shield() -> None:
 
 @pytest.mark.parametrize("target", sorted(BURSTS))
 def test_banelings_needed(target: str) -> None:
-    count = BURSTS[target]
-    for banelings, survives in ((count, False), (count - 1, True)):
-        if banelings == 0:
-            continue
-        scenario = battle_of([(target, 1)], [("Baneling", banelings)])
-        ring = [
-            (16 + 1.1 * math.cos(a), 16 + 1.1 * math.sin(a))
-            for a in np.linspace(0, 2 * math.pi, banelings, endpoint=False)
-        ]
-        units = placed(scenario, [(16.0, 16.0), *ring])
-        units, _ = play(scenario, units, standing(1), 40)
-        assert not np.asarray(units.health[1:] > 0).any()
-        assert bool(units.health[0] > 0) == survives
+    most = max(BURSTS.values())
+    scenario = battle_of([(target, 1)], [("Baneling", most)])
+    ring = [
+        (16 + 1.1 * math.cos(a), 16 + 1.1 * math.sin(a))
+        for a in np.linspace(0, 2 * math.pi, most, endpoint=False)
+    ]
+    units = placed(scenario, [(16.0, 16.0), *ring])
+    for banelings, survives in ((BURSTS[target], False), (BURSTS[target] - 1, True)):
+        there = jnp.arange(most + 1) <= banelings
+        after, _ = play(
+            scenario,
+            units._replace(health=jnp.where(there, units.health, 0.0), burst=~there),
+            standing(1),
+            40,
+        )
+        assert not np.asarray(after.health[1:] > 0).any() or banelings == 0
+        assert bool(after.health[0] > 0) == survives
 
 
 def test_five_bursts_kill_any_number_of_zealots_in_reach() -> None:

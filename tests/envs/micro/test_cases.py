@@ -96,10 +96,7 @@ def test_one_wrong_file_among_good_ones(tmp_path: Path) -> None:
         lambda t: t["cases"][0].update(episode_steps_before_first_step="many"),
         lambda t: frame(t).update(obs="nothing"),
         lambda t: frame(t)["obs"][0].pop(),
-        pytest.param(
-            lambda t: frame(t).update(info=None),
-            marks=pytest.mark.xfail(strict=True, reason="AttributeError"),
-        ),
+        lambda t: frame(t).update(info=None),
         lambda t: t.update(map=3),
         lambda t: t.update(cases=3),
     ],

@@ -13,13 +13,12 @@ from race.cli.render import PolicyName
 from race.envs.micro import Battle, make, map_names, smac
 from race.envs.micro.battle import LOOPS_PER_STEP, NORTH
 from race.envs.micro.canvas import WHITE, Canvas, Window
-from race.envs.micro.maps import WALL
 from race.envs.micro.policies import POLICIES
 from race.envs.micro.recording import Recording, play, step_and_film, verdict_of
 from race.envs.micro.render import Painter, frames, n_frames, used, whole
 from race.envs.micro.smac import Info
 from race.envs.micro.state import Units
-from race.envs.micro.units import UNIT_TYPES, Mover
+from race.envs.micro.units import UNIT_TYPES, WALL, Mover
 
 step = jax.jit(smac.step)
 filmed = jax.jit(step_and_film)

@@ -154,7 +154,6 @@ def test_moves_on_the_rim(place: float) -> None:
     assert shown.avail_actions[1, 2:6].tolist() == [on_outwards, inwards, on, on]
 
 
-@pytest.mark.xfail(strict=True, reason="x - 1 is rounded to -1 in single precision")
 def test_moves_from_the_very_rim() -> None:
     """SMAC subtracts in double precision: -1 + 1e-9 is cut to 0, where there is ground."""
     see("3s_vs_3z", plain("3s_vs_3z", x={0: 1e-9}, y={0: 16}))

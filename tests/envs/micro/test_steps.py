@@ -115,7 +115,6 @@ def test_nothing_changes_after_the_end(name: str) -> None:
         assert bool(timestep.terminated)
 
 
-@pytest.mark.xfail(strict=True, reason="info tells of a battle that goes on after its end")
 def test_facts_stay_after_the_end() -> None:
     """Also where the next hits would kill, if there were any."""
     env, env_state, last = ended("2s3z")
@@ -177,7 +176,6 @@ def test_shields_come_back_after_ten_seconds() -> None:
     np.testing.assert_allclose(np.diff(shields[20:]), 1.0, atol=1e-4)
 
 
-@pytest.mark.xfail(strict=True, reason="cells of negative coordinates wrap round to the east")
 def test_a_move_beyond_the_rim_leads_to_the_rim(tmp_path: Path) -> None:
     """On ground with obstacles too, where units look up their ways."""
     rows = [14 * "."] * 4 + ["....######...."] * 4 + [14 * "."] * 4
@@ -251,7 +249,6 @@ def moved(name: str, tmp_path: Path, old: str, new: str) -> Scenario:
     return make(str(path)).scenario
 
 
-@pytest.mark.xfail(strict=True, reason="numbers of units are weakly typed after a reset only")
 def test_steps_compile_once_for_all_maps_of_a_shape(tmp_path: Path) -> None:
     step, compilations = counted()
     scenario = make("2s3z").scenario
@@ -286,7 +283,6 @@ def test_battles_share_their_programs(tmp_path: Path) -> None:
     assert sizes[0] == sizes[1]
 
 
-@pytest.mark.xfail(strict=True, reason="tables of ways are as large as the ground, Shape is not")
 def test_maps_with_walls_share_a_program_too(tmp_path: Path) -> None:
     step, compilations = counted()
     text = (
