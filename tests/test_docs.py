@@ -1,5 +1,6 @@
 """Every command that the README and the documents show runs, in their order, at a small size."""
 
+import importlib
 import re
 import shlex
 from pathlib import Path
@@ -48,6 +49,40 @@ def test_commands_in_documents_run(
         words = shlex.split(line)
         words = words[words.index("race") + 1 :]
         main([*words, *shlex.split(SMALL[words[0]])])
+
+
+def test_modules_called_in_documents_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    small = {"cases": "", "tournament": "--battles 2 3s_vs_3z"}
+    called = []
+    for document in DOCUMENTS:
+        for block in re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL):
+            for module, words in re.findall(
+                r"^python -m race\.envs\.micro\.(\w+)(.*)$", block, re.M
+            ):
+                called.append(module)
+                files = [
+                    str(file)
+                    for word in shlex.split(words)
+                    for file in (sorted(ROOT.glob(word)) or [word])
+                ]
+                run = importlib.import_module(f"race.envs.micro.{module}").main
+                assert run([*files, *shlex.split(small[module])]) == 0
+    assert sorted(set(called)) == ["cases", "tournament"]
+
+
+def test_examples_of_battles_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from race.envs.micro import make
+
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs/micro.md").read_text()
+    examples = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    assert len(examples) == 2
+    for example in examples:
+        exec(example, {})
+    (table,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
+    Path("3m.toml").write_text(table)
+    assert (make("3m.toml").shape.n_allies, make("3m.toml").shape.n_enemies) == (3, 3)
 
 
 def test_the_readme_names_every_command() -> None:

@@ -14,7 +14,7 @@ COMMANDS = {
     "train": "train a team",
     "resume": "go on with a run exactly where it was",
     "evaluate": "play test episodes with a trained team and report its returns",
-    "render": "make a video of a trained team",
+    "render": "make a video of a trained team, or of a battle",
     "plot": "draw learning curves of one or more runs",
     "list": "show tasks, algorithms and presets",
     "bench": "measure speed and memory on this machine",
