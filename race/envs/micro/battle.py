@@ -37,8 +37,10 @@ def orders(scenario: Scenario, units: Units, actions: Int[Any, "n"]) -> Orders:
     n = scenario.shape.n_allies
     named = actions - FIRST_TARGET
     target = jnp.where(scenario.healing_columns, named, named + n)
-    step_x = jnp.where(actions == EAST, MOVE, 0.0) - jnp.where(actions == WEST, MOVE, 0.0)
-    step_y = jnp.where(actions == NORTH, MOVE, 0.0) - jnp.where(actions == SOUTH, MOVE, 0.0)
+    # A flyer would brake for the end of a move that it never reaches.
+    reach = jnp.where(scenario.flying[:n], 2 * MOVE, MOVE)
+    step_x = jnp.where(actions == EAST, reach, 0.0) - jnp.where(actions == WEST, reach, 0.0)
+    step_y = jnp.where(actions == NORTH, reach, 0.0) - jnp.where(actions == SOUTH, reach, 0.0)
     return Orders(
         target=jnp.where(named >= 0, target, NOBODY).astype(units.target.dtype),
         walks=(actions >= NORTH) & (actions <= WEST),
@@ -81,14 +83,16 @@ def _loops(
 def game_loop(scenario: Scenario, units: Units, given: Orders, delays: Float[Any, "U"]) -> Units:
     """1/16 s: choose targets, attack, heal, regenerate, move."""
     shape, n = scenario.shape, scenario.shape.n_allies
-    units = units._replace(cooldown=jnp.maximum(units.cooldown - 1, 0.0))
+    units = units._replace(
+        cooldown=jnp.maximum(units.cooldown - 1, 0.0), since_shot=units.since_shot + 1
+    )
     enemy_target = opponent.choose_targets(scenario, units)
     goal = opponent.march(scenario, units, enemy_target)
     target = jnp.concatenate([given.target, enemy_target])
     if shape.n_healers:
-        own = scenario.healers >= n
+        enemies = scenario.healers >= n
         patient = jnp.where(
-            own, opponent.choose_patients(scenario, units), target[scenario.healers]
+            enemies, opponent.choose_patients(scenario, units), target[scenario.healers]
         )
         target = target.at[scenario.healers].set(patient)
     walks = jnp.concatenate([given.walks, jnp.zeros(shape.n_enemies, bool)])
@@ -97,7 +101,7 @@ def game_loop(scenario: Scenario, units: Units, given: Orders, delays: Float[Any
     fought = combat.strike(scenario, units, target, sight, attack, walks, delays)
     fought = combat.heal(scenario, fought, target, sight.gap)
     fought = combat.regenerate(scenario, fought)
-    recovers = (units.struck == target) & (units.cooldown > scenario.period - scenario.backswing)
+    recovers = (units.struck == target) & (units.since_shot < scenario.backswing)
     near = sight.valid & (sight.gap <= scenario.range)
     fights = near | attack.aims | (sight.valid & recovers)
     follows = sight.valid

@@ -112,6 +112,7 @@ def strike(
     others = _beam(scenario, units, pending, alive)
     units = units._replace(
         cooldown=jnp.where(fires, scenario.period + delays, units.cooldown),
+        since_shot=jnp.where(fires, 0.0, units.since_shot),
         pending=jnp.where(fires, jnp.where(flight <= 0, scenario.second_hit, flight), pending),
         struck=jnp.where(fires, target, units.struck),
         aiming=attack.aiming,
@@ -127,7 +128,7 @@ def strike(
     enemy_hits = [first[n:, :n], second[:, :n], others[:, :n], others[:, :n]]
     used = 4 if shape.n_beams else 1
     ally_hits, enemy_hits = ally_hits[:used], enemy_hits[:used]
-    units = units._replace(struck_by=_attackers(scenario, units.struck_by, ally_hits))
+    units = units._replace(struck_by=_attackers(scenario, units.struck_by, alive, ally_hits))
     units = _take(
         units,
         shape.n_allies,
@@ -194,10 +195,14 @@ def _take(
 
 
 def _attackers(
-    scenario: Scenario, known: Int[Any, "m"], hits: list[Float[Any, "_ m"]]
+    scenario: Scenario,
+    known: Int[Any, "m"],
+    alive: Bool[Any, "U"],
+    hits: list[Float[Any, "_ m"]],
 ) -> Int[Any, "m"]:
     n = scenario.shape.n_allies
-    attacker = jnp.max(jnp.where(hits[0] > 0, jnp.arange(n)[:, None], NOBODY), axis=0)
+    by_living = (hits[0] > 0) & alive[:n, None]  # a missile may outlive its shooter
+    attacker = jnp.max(jnp.where(by_living, jnp.arange(n)[:, None], NOBODY), axis=0)
     if scenario.shape.n_beams:
         beams = scenario.beams[:, None]
         attacker = jnp.maximum(attacker, jnp.max(jnp.where(hits[2] > 0, beams, NOBODY), axis=0))
@@ -282,6 +287,10 @@ def heal(scenario: Scenario, units: Units, target: Int[Any, "U"], gap: Float[Any
     patient = target[healers]
     alive = (units.health[healers] > 0) & (patient >= 0) & (units.health[patient] > 0)
     able = alive & scenario.biological[patient] & (gap[healers] <= HEAL_RANGE)
+    # Only one healer mends a patient at a time.
+    order = jnp.arange(len(healers))
+    earlier = (order[:, None] > order[None]) & able[None]
+    able &= ~jnp.any(earlier & (patient[:, None] == patient[None]), axis=1)
     energy = units.energy[healers]
     missing = scenario.max_health[patient] - units.health[patient]
     given = jnp.minimum(jnp.minimum(HEAL_RATE / LOOPS_PER_SECOND, missing), energy / HEAL_COST)

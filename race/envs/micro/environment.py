@@ -163,7 +163,8 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
                 f"Map {self._battle.spec.name} needs one whole number per agent, {n} in all; the "
                 f"action was an array of shape {actions.shape} and type {actions.dtype}."
             )
-        actions, key, before = actions.astype(np.int32), self._next_key(), self._env_state
+        actions = np.clip(actions, -1, self._battle.shape.n_actions).astype(np.int32)
+        key, before = self._next_key(), self._env_state
         if self._painter is None:
             self._env_state, timestep = self._battle.step(before, actions, key)
         else:

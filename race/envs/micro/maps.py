@@ -233,8 +233,10 @@ def _columns(name: str, table: dict[str, Any], key: str) -> tuple[str, ...]:
 
 
 def _order(name: str, table: dict[str, Any]) -> EnemyOrder:
-    order = _table(name, "'enemy_order'", table.get("enemy_order"), {"kind", "to"})
-    kind: Any = order.get("kind")
+    order = table.get("enemy_order")
+    kind: Any = order.get("kind") if isinstance(order, dict) else None
+    known = {"kind"} if kind in ("attack_nearest", "hold") else {"kind", "to"}
+    order = _table(name, "'enemy_order'", order, known)
     if kind not in get_args(OrderKind):
         raise TaskError(
             f"Map {name}: kind of enemy_order must be one of {', '.join(get_args(OrderKind))}, and "

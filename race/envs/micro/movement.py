@@ -47,7 +47,11 @@ def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> 
     share = jnp.where(alive, jnp.minimum(1.0, scenario.speed / jnp.maximum(length, 1e-6)), 0.0)
     x, y = _stop_at_walls(scenario, units, units.x + dx * share, units.y + dy * share)
     x, y = jnp.where(alive, x, units.x), jnp.where(alive, y, units.y)
-    return units._replace(x=x, y=y, vx=x - units.x, vy=y - units.y)
+    going_x, going_y = x - units.x, y - units.y
+    if scenario.shape.flyers:  # which slow down too gently to take a push along
+        going_x = jnp.where(scenario.flying, vx, going_x)
+        going_y = jnp.where(scenario.flying, vy, going_y)
+    return units._replace(x=x, y=y, vx=going_x, vy=going_y)
 
 
 def _own_step(
@@ -139,11 +143,12 @@ def _stop_at_walls(
 ) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
     """Keeps centres at their inner radius from walls, first in x, then in y.
 
-    A unit that is nearer already, because it was created there, is not moved but comes no nearer.
+    A unit that is nearer already, because it was created there, comes no nearer.
     """
     low_x, high_x, low_y, high_y = scenario.bounds
     if scenario.shape.plain:
-        return jnp.clip(x, low_x, high_x), jnp.clip(y, low_y, high_y)
+        x = jnp.clip(x, jnp.minimum(low_x, units.x), jnp.maximum(high_x, units.x))
+        return x, jnp.clip(y, jnp.minimum(low_y, units.y), jnp.maximum(high_y, units.y))
     walls, mover, inner = scenario.walls, scenario.mover, scenario.inner_radius
 
     def between(

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 
 from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import NOBODY, Units
-from race.envs.micro.units import HEAL_RANGE
+from race.envs.micro.units import HEAL_COST, HEAL_RANGE, HEAL_RATE, LOOPS_PER_SECOND
 
 LEASH: Final = 21.0
 """Centre distance at which an enemy gives up an ally that it chases."""
@@ -82,7 +82,7 @@ def choose_patients(scenario: Scenario, units: Units) -> Int[Any, "healers"]:
     """The friend that each healer would heal by itself, or `NOBODY`.
 
     Of the hurt biological friends in range the one with the lowest share of its health, then the
-    nearest. A patient is kept until it is whole.
+    nearest. A patient is kept until it is whole or the energy is gone.
     """
     healers, n = scenario.healers, scenario.shape.n_allies
     everyone = jnp.arange(scenario.shape.n_units)
@@ -91,6 +91,7 @@ def choose_patients(scenario: Scenario, units: Units) -> Int[Any, "healers"]:
     hurt = (units.health > 0) & (units.health < scenario.max_health) & scenario.biological
     gap = gaps(scenario, units, healers)
     kept = (everyone[None] == units.target[healers][:, None]) & (gap <= HEAL_RANGE + CAST_SLOP)
+    kept &= (units.energy[healers] >= HEAL_COST * HEAL_RATE / LOOPS_PER_SECOND)[:, None]
     may_begin = units.energy[healers] >= CAST_ENERGY
     offered = friends & hurt[None] & (kept | ((gap <= CAST_RANGE) & may_begin[:, None]))
     share = units.health / scenario.max_health

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from race.envs.micro.maps import MapSpec
 from race.envs.micro.terrain import Terrain, survey
-from race.envs.micro.units import LOOPS_PER_SECOND, UNIT_TYPES, Mover, UnitType, Weapon
+from race.envs.micro.units import GROUND, LOOPS_PER_SECOND, UNIT_TYPES, Mover, UnitType, Weapon
 
 SCAN_RANGE: Final = 5.0
 """How near, edge to edge, an ally must come before an enemy with a shorter weapon attacks it."""
@@ -104,6 +104,7 @@ class Scenario:
     regeneration: Float[Any, "U"]
     flying: Bool[Any, "U"]
     biological: Bool[Any, "U"]
+    """Whether healers mend it: biological, and no structure."""
     inner_radius: Float[Any, "U"]
     healers: Int[Any, "healers"]
 
@@ -203,7 +204,9 @@ def _build(spec: MapSpec) -> Scenario:
         bounds=_bounds(types, ground),
         regeneration=_f([t.health_regeneration for t in types]) / LOOPS_PER_SECOND,
         flying=np.array([t.mover is Mover.AIR for t in types]),
-        biological=np.array(["biological" in t.attributes for t in types]),
+        biological=np.array(
+            ["biological" in t.attributes and "structure" not in t.attributes for t in types]
+        ),
         inner_radius=_f([t.inner_radius for t in types]),
         healers=np.array([i for i, t in enumerate(types) if t.heals], np.int32),
         weapon_air=np.array([w.air for w in weapons]),
@@ -360,7 +363,7 @@ def _goals(spec: MapSpec, places: NDArray[np.float64]) -> NDArray[np.float64]:
         for k in range(n, len(goals)):
             x, y = np.floor(goals[k]).astype(int)
             inside = 0 <= x < spec.cells.shape[0] and 0 <= y < spec.cells.shape[1]
-            if not inside or spec.cells[x, y] != ".":
+            if not inside or spec.cells[x, y] != GROUND:
                 goals[k] = point
     return goals
 
@@ -372,8 +375,8 @@ def _contacts(types: list[UnitType]) -> tuple[NDArray[np.float32], NDArray[np.fl
     for i, one in enumerate(types):
         for j, other in enumerate(types):
             if i != j and _collide(one, other):
-                both_fly = one.mover is Mover.AIR
-                stiffness[i, j] = AIR_STIFFNESS if both_fly else STIFFNESS
+                in_the_air = Mover.AIR in (one.mover, other.mover)
+                stiffness[i, j] = AIR_STIFFNESS if in_the_air else STIFFNESS
     return _f(np.where(stiffness > 0, np.square(contact), 0.0)), _f(stiffness / 2)
 
 
@@ -381,7 +384,7 @@ def _collide(one: UnitType, other: UnitType) -> bool:
     movers = {one.mover, other.mover}
     if movers == {Mover.CLIFF, Mover.GROUND}:
         return "structure" in one.attributes | other.attributes
-    return len(movers) == 1
+    return len(movers) == 1 or movers == {Mover.CLIFF, Mover.AIR}
 
 
 def _one_hot(columns: tuple[str, ...], units: list[str]) -> NDArray[np.float32]:

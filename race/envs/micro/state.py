@@ -9,6 +9,8 @@ from race.envs.micro.scenario import Scenario
 from race.envs.micro.units import START_ENERGY
 
 NOBODY = -1
+NEVER = 1e6
+"""Game loops since something that has not happened."""
 
 
 class Units(NamedTuple):
@@ -27,6 +29,8 @@ class Units(NamedTuple):
     energy: Float[Any, "U"]
     cooldown: Float[Any, "U"]
     """Until the weapon is ready."""
+    since_shot: Float[Any, "U"]
+    """Since the last attack left the unit."""
     since_hit: Float[Any, "U"]
     """Since the last damage taken."""
     target: Int[Any, "U"]
@@ -70,6 +74,7 @@ def start(scenario: Scenario) -> EnvState:
         shield=scenario.max_shield,
         energy=zeros.at[scenario.healers].set(START_ENERGY),
         cooldown=zeros,
+        since_shot=jnp.full(shape.n_units, NEVER),
         since_hit=zeros,
         target=nobody,
         aiming=zeros,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
 from race.envs.micro.units import CLIFF, GROUND, Mover
+from race.errors import TaskError
 
 EAST, WEST, NORTH, SOUTH = 1, 2, 4, 8
 """Bits of `Terrain.walls`."""
@@ -19,6 +20,8 @@ EAST, WEST, NORTH, SOUTH = 1, 2, 4, 8
 CLEARANCE: Final = 0.45
 """How far ways keep from walls: less than half a cell, so that the middle of any cell will do."""
 _SAMPLES_PER_CELL: Final = 4
+MOST_CELLS: Final = 1024
+"""Cells of ground with obstacles that a map may have; the ways on more take minutes."""
 _ROUND: Final = 128
 """Tables are as long as a multiple of this, so that maps of similar size share their programs."""
 
@@ -56,6 +59,9 @@ def survey(cells: NDArray[Any], movers: tuple[Mover, ...], starts: NDArray[np.fl
         movers: the kinds of movers on the map.
         starts: where units start, [units, 2]; ground that cannot be reached from there is left
             out of the ways.
+
+    Raises:
+        TaskError: if there are more than `MOST_CELLS` cells of ground with obstacles.
     """
     grounds = [_enterable(cells, mover) for mover in Mover]
     areas = [
@@ -64,6 +70,11 @@ def survey(cells: NDArray[Any], movers: tuple[Mover, ...], starts: NDArray[np.fl
     ]
     walled = [m for m in movers if m is not Mover.AIR and not _is_rectangle(areas[m])]
     most = max((int(areas[m].sum()) for m in walled), default=0)
+    if most > MOST_CELLS:
+        raise TaskError(
+            f"The map has {most:,} cells of ground with obstacles, and ways are only worked out "
+            f"for {MOST_CELLS:,}. Make it smaller, or one rectangle of ground without obstacles."
+        )
     size = math.ceil(most / _ROUND) * _ROUND
     node = np.zeros((len(Mover), *cells.shape) if walled else (len(Mover), 0, 0), np.int32)
     ways = np.zeros((len(Mover), size, size), np.int32)

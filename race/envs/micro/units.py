@@ -87,7 +87,7 @@ class UnitType:
             None where SMAC has no such ally: the weapon's period in game loops.
         shield: at most; it comes back `shield_delay` seconds after the last damage.
         acceleration: cells per second squared.
-        heals: whether it heals friends that have the attribute "biological".
+        heals: whether it heals friends that are biological and no structures.
         health_regeneration: health per second.
         weapon: None if it cannot attack.
     """

@@ -232,22 +232,22 @@ def test_what_a_weapon_cannot_reach_is_never_a_target() -> None:
 
 def test_who_is_hit_from_afar_chases_and_idle_friends_within_four_join() -> None:
     scenario = arena(PROTOSS)
-    attacker, victim, near, far, busy = 0, 4, 5, 6, 7
+    attacker, victim, busy, near, far = 0, 4, 5, 6, 7
     places = {
         attacker: (23.05, 16.0),
         victim: (16.0, 16.0),
         near: (16.2, 19.7),
         far: (16.5, 11.85),
-        # It fights somebody of its own, who is nearer to it than to the others.
-        busy: (13.0, 17.0),
-        2: (6.5, 17.0),
+        # It chases somebody of its own, beyond its scan range.
+        busy: (17.0, 13.6),
+        2: (4.0, 13.6),
     }
     scenario = dataclasses.replace(
         scenario,
         goal_x=jnp.array([places[k][0] for k in range(4, 8)]),
         goal_y=jnp.array([places[k][1] for k in range(4, 8)]),
     )
-    units = present(scenario, places, health={2: 1e4})
+    units = present(scenario, places, target={busy: 2})
     given = stand(scenario, units, {attacker: victim})
     film = watch(scenario, units, 5, given)
     whole = film.health[:, victim] + film.shield[:, victim] == 150
@@ -260,10 +260,11 @@ def test_who_is_hit_from_afar_chases_and_idle_friends_within_four_join() -> None
     heard = 8 * math.ceil(hit / 8)  # calls are answered once per environment step
     assert (film.target[1 : heard + 1, near] == NOBODY).all()
     assert (film.target[heard + 1 :, near] == attacker).all()
-    assert apart(film, attacker, near)[-1] < apart(film, attacker, near)[0] - 1
+    assert apart(film, attacker, near)[-1] < 7.25 < apart(film, attacker, near)[heard]
     assert (film.target[1:, far] == NOBODY).all()
     assert not moved(film, far)
-    assert apart(film, busy, victim)[0] < 4
+    assert apart(film, busy, victim)[heard] < 4
+    assert apart(film, busy, 2).min() > 6.2
     assert (film.target[1:, busy] == 2).all()
 
 
@@ -450,11 +451,15 @@ def test_an_enemy_healer_begins_at_five_energy_and_ends_without_any() -> None:
     assert film.energy[begins - 1, healer] == pytest.approx(5.0, abs=0.04)
     assert (film.health[:begins, patient] == 1).all()
     assert (film.target[1:begins, healer] == NOBODY).all()
-    # It does not stop below 5: 33 loops use up what is there.
-    assert (film.target[begins:, healer] == patient).all()
-    full = np.diff(film.health[begins - 1 :, patient])[:32]
-    np.testing.assert_allclose(full, 9 / 16, atol=1e-4)
-    assert film.energy[begins + 35 :, healer].max() < 0.1
+    # It does not stop below 5, but when nothing is left.
+    ends = begins + int(np.argmax(film.target[begins:, healer] == NOBODY))
+    assert ends > begins + 30
+    assert film.energy[ends - 1, healer] < 0.2
+    np.testing.assert_allclose(
+        np.diff(film.health[begins - 1 : ends - 1, patient]), 9 / 16, atol=1e-4
+    )
+    assert (film.target[ends:, healer] == NOBODY).all()
+    assert (film.health[ends:, patient] == film.health[ends, patient]).all()
     # A healer that looked away must wait until it has five again.
     later = watch(
         scenario, present(scenario, places, health={patient: 1.0}, energy={healer: 2.0}), 4
