@@ -32,14 +32,12 @@ class Results(NamedTuple):
 
 def play(battle: Battle, policy: Policy, key: Key[Array, ""], battles: int) -> Results:
     """Plays battles to their ends, all at once."""
-    results = _play(policy, battles, battle.spec.episode_limit, battle.scenario, key)
+    results = _play(policy, battles, battle.scenario, key)
     return Results(*map(np.asarray, results))
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1, 2))
-def _play(
-    policy: Policy, battles: int, limit: int, scenario: Scenario, key: Key[Array, ""]
-) -> Results:
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _play(policy: Policy, battles: int, scenario: Scenario, key: Key[Array, ""]) -> Results:
     def one(key: Key[Array, ""]) -> Results:
         def going(carry: Any) -> Any:
             return ~carry[0].over
