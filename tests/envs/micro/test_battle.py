@@ -13,7 +13,17 @@ from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from race.envs.micro import combat, smac
-from race.envs.micro.battle import EAST, FIRST_TARGET, NORTH, SOUTH, STOP, WEST, Orders, game_loop
+from race.envs.micro.battle import (
+    EAST,
+    FIRST_TARGET,
+    NO_OP,
+    NORTH,
+    SOUTH,
+    STOP,
+    WEST,
+    Orders,
+    game_loop,
+)
 from race.envs.micro.maps import load_map, parse_map
 from race.envs.micro.scenario import Scenario, build
 from race.envs.micro.state import NOBODY, EnvState, Units, start
@@ -386,42 +396,57 @@ def test_two_stalkers_that_stand_before_the_crawler_lose() -> None:
     assert 16 <= round(lost.sum() / 12) <= 19
 
 
-def closest(env_state: EnvState, agent: int, n: int) -> tuple[float, float, float]:
+def gaps_to_enemies(env_state: EnvState, x: float, y: float, n: int) -> NDArray[np.float64]:
+    """Centre distances from a point to the enemies; the dead are far."""
     u = env_state.units
-    dx = np.asarray(u.x[n:]) - float(u.x[agent])
-    dy = np.asarray(u.y[n:]) - float(u.y[agent])
-    near = int(np.argmin(dx**2 + dy**2))
-    return float(dx[near]), float(dy[near]), float(np.hypot(dx[near], dy[near]))
+    distance = np.hypot(np.asarray(u.x[n:], float) - x, np.asarray(u.y[n:], float) - y)
+    return np.where(np.asarray(u.health[n:]) > 0, distance, 99.0)
 
 
 def kite(env_state: EnvState, n: int) -> list[int]:
     """Shoot when ready and not about to be caught; else away along a wide circle."""
-    actions = []
+    actions, u = [], env_state.units
     for agent in range(n):
-        dx, dy, distance = closest(env_state, agent, n)
-        ready = float(env_state.units.cooldown[agent]) <= 3
-        if ready and 3.0 < distance <= 6.0:
-            actions.append(FIRST_TARGET)
-            continue
-        if ready and distance > 6.0:
+        x, y = float(u.x[agent]), float(u.y[agent])
+        gaps = gaps_to_enemies(env_state, x, y, n)
+        near, ready = int(np.argmin(gaps)), float(u.cooldown[agent]) <= 3
+        if float(u.health[agent]) <= 0:
+            actions.append(NO_OP)
+        elif ready and 3.0 < gaps[near] <= 6.0:
+            actions.append(FIRST_TARGET + near)
+        elif ready and gaps[near] > 6.0:
             actions.append(STOP)
-            continue
-        x, y = float(env_state.units.x[agent]) - 16, float(env_state.units.y[agent]) - 16
-        best, value = STOP, -math.inf
-        for action, (mx, my) in {
-            EAST: (1, 0),
-            WEST: (-1, 0),
-            NORTH: (0, 1),
-            SOUTH: (0, -1),
-        }.items():
-            to_x, to_y = x + 1.48 * mx, y + 1.48 * my
-            gap = math.hypot(to_x - (x + dx), to_y - (y + dy))
-            wall = max(abs(to_x), abs(to_y)) - 11
-            score = gap - 4 * max(wall, 0.0)
-            if score > value:
-                best, value = action, score
-        actions.append(best)
+        else:
+            values = {}
+            for action, (mx, my) in MOVES.items():
+                to_x, to_y = x + 1.48 * mx, y + 1.48 * my
+                rim = max(abs(to_x - 16), abs(to_y - 16)) - 11
+                gap = gaps_to_enemies(env_state, to_x, to_y, n).min()
+                values[action] = gap - 4 * max(rim, 0.0)
+            actions.append(max(values, key=lambda action: values[action]))
     return actions
+
+
+def fought_out(scenario: Scenario, seed: int, *, kites: bool) -> tuple[EnvState, smac.Info]:
+    """The end of a battle of agents that kite, or that stand and shoot the first enemy."""
+    n, key = scenario.shape.n_allies, jax.random.key(seed)
+    env_state, observation = smac.reset(scenario, key)
+    for t in range(400):
+        shoots = np.asarray(observation.avail_actions[:, FIRST_TARGET])
+        stands = [FIRST_TARGET if near else STOP for near in shoots]
+        actions = kite(env_state, n) if kites else stands
+        env_state, timestep = STEP(
+            scenario, env_state, jnp.array(actions), jax.random.fold_in(key, t)
+        )
+        assert not timestep.info.refused.any()
+        observation = timestep.observation
+        if timestep.terminated:
+            break
+    return env_state, timestep.info
+
+
+STEP = jax.jit(smac.step)
+MOVES = {EAST: (1, 0), WEST: (-1, 0), NORTH: (0, 1), SOUTH: (0, -1)}
 
 
 def test_a_stalker_that_kites_a_zealot_wins_unhurt_and_one_that_stands_dies() -> None:
@@ -429,23 +454,17 @@ def test_a_stalker_that_kites_a_zealot_wins_unhurt_and_one_that_stands_dies() ->
     text += 'to = [10.0, 16.0]\n[[allies]]\nunit = "Stalker"\ncount = 1\nat = [10.0, 16.0]\n'
     text += '[[enemies]]\nunit = "Zealot"\ncount = 1\nat = [20.0, 16.0]\n'
     scenario = build(parse_map("duel", text))
-    step = jax.jit(smac.step)
-    for kites in (True, False):
-        key = jax.random.key(1)
-        env_state, _ = smac.reset(scenario, key)
-        for t in range(400):
-            near = closest(env_state, 0, 1)[2] <= 6
-            actions = kite(env_state, 1) if kites else [FIRST_TARGET if near else STOP]
-            env_state, timestep = step(
-                scenario, env_state, jnp.array(actions), jax.random.fold_in(key, t)
-            )
-            assert not timestep.info.refused.any()
-            if timestep.terminated:
-                break
-        assert bool(timestep.info.battle_won) == kites
-        if kites:
-            assert env_state.units.health[0] == 80
-            assert env_state.units.shield[0] == 80
+    end, info = fought_out(scenario, 1, kites=True)
+    assert info.battle_won
+    assert (end.units.health[0], end.units.shield[0]) == (80, 80)
+    assert not fought_out(scenario, 1, kites=False)[1].battle_won
+
+
+def test_stalkers_that_kite_win_3s_vs_3z_without_a_loss() -> None:
+    for seed in range(2):
+        _, info = fought_out(build(load_map("3s_vs_3z")), seed, kites=True)
+        assert info.battle_won
+        assert info.dead_allies == 0
 
 
 def test_colossi_cross_the_cliff_that_zerglings_must_go_round() -> None:
