@@ -14,7 +14,8 @@ letter      axis
 ``H``       units of an observation embedding z
 ``P``       teams of the population
 ``T``       teams that act: the population, then the MARL team
-``K``       critics of an ensemble (2 for MATD3, 1 for MADDPG)
+``K``       critics of an ensemble (2 for MATD3, 1 for MADDPG and FACMAC)
+``L``       moments of an episode: before each of its steps, and after the last
 ==========  =====================================================================
 """
 
@@ -25,7 +26,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from race.errors import TaskError
@@ -44,6 +45,32 @@ class Transition(NamedTuple):
     reward: Float[Any, "*b"]
     terminated: Float[Any, "*b"]
     next_state: Float[Any, "*b S"]
+
+
+class Observation(NamedTuple):
+    """A moment of a task with discrete actions; ``A`` counts the actions to choose from."""
+
+    obs: Float[Any, "N O"]
+    state: Float[Any, "S"]
+    avail_actions: Bool[Any, "N A"]
+
+
+class Episode(NamedTuple):
+    """A whole episode of a task with discrete actions, or a batch of them (axes ``...``).
+
+    It has room for ``L - 1`` steps, of which the first ``length`` were made; the rest is padding,
+    zeros. Moment t is before step t, so the moment of index ``length`` is the one after the last
+    step. ``terminated`` is 1 at a last step that ended the task itself, and 0 at one that an
+    outer time limit made the last.
+    """
+
+    obs: Float[Any, "*b L N O"]
+    state: Float[Any, "*b L S"]
+    avail_actions: Bool[Any, "*b L N A"]
+    action: Int[Any, "*b L-1 N"]
+    reward: Float[Any, "*b L-1"]
+    terminated: Float[Any, "*b L-1"]
+    length: Int[Any, "*b"]
 
 
 class Rollout(NamedTuple):
@@ -195,6 +222,7 @@ class DiscreteSpec:
         state_size: entries of the global state S.
         n_actions: actions that each agent has to choose from; not all are always available.
         episode_limit: steps after which an episode ends.
+        has_wins: whether an episode can be won, which ``info["battle_won"]`` of a step tells.
     """
 
     task: str
@@ -203,18 +231,57 @@ class DiscreteSpec:
     state_size: int
     n_actions: int
     episode_limit: int
+    has_wins: bool = False
+
+    @property
+    def action_mask(self) -> NDArray[np.bool_]:
+        """True everywhere, shape [N, A]: no action of a head is padding."""
+        return np.ones((self.n_agents, self.n_actions), np.bool_)
+
+
+Spec = EnvSpec | DiscreteSpec
+"""What a learner knows of a task."""
+
+
+class Outcome(NamedTuple):
+    """What a step of a `DeviceEnv` brought, besides the next observation."""
+
+    reward: Float[Any, ""]
+    terminated: Bool[Any, ""]
+    truncated: Bool[Any, ""]
+    won: Bool[Any, ""]
+
+
+class DeviceEnv(NamedTuple):
+    """A task with discrete actions as pure functions of JAX, whose rollouts are compiled.
+
+    ``reset`` and ``step`` are functions of a module, so that one program serves all environments
+    that differ in ``arrays`` alone. An `environment <DiscreteTask.make>` on the host and this one
+    are the same task: with the same key, each reset and each step takes
+    ``key, now = jax.random.split(key)`` and uses ``now``.
+    """
+
+    arrays: Any
+    """What the functions read of the task: a pytree."""
+    reset: Callable[[Any, Any], tuple[Any, Observation]]
+    """(arrays, key) -> env_state, observation."""
+    step: Callable[[Any, Any, Any, Any], tuple[Any, Observation, Outcome]]
+    """(arrays, env_state, actions [N], key) -> env_state, observation, outcome. It is also called
+    after the end of an episode, where only its result is ignored."""
 
 
 class DiscreteTask(NamedTuple):
-    """A task with discrete actions: its sizes and the way to make its environment.
+    """A task with discrete actions: its sizes and the ways to make its environment.
 
     ``make(render_mode)`` returns a `gymnasium.Env` whose observation is a dictionary of ``obs``
     [N, O], ``state`` [S] and ``avail_actions`` [N, n_actions], and whose action is one number per
-    agent, [N]. ``render_mode`` is None or ``"rgb_array"``.
+    agent, [N]. ``render_mode`` is None or ``"rgb_array"``. ``device()``, where there is one,
+    returns the same task for rollouts on the device.
     """
 
     spec: DiscreteSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
+    device: Callable[[], DeviceEnv] | None = None
 
 
 class Task(NamedTuple):
@@ -228,3 +295,6 @@ class Task(NamedTuple):
 
     spec: EnvSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
+
+
+AnyTask = Task | DiscreteTask

@@ -17,8 +17,9 @@ from jaxtyping import Array, Int, Key
 from race.envs.micro import smac
 from race.envs.micro.maps import MapSpec, load_map, map_names
 from race.envs.micro.scenario import Scenario, Shape, build
-from race.envs.micro.smac import Info, Observation, Timestep
+from race.envs.micro.smac import Info, Timestep
 from race.envs.micro.state import EnvState
+from race.types import Observation
 
 __all__ = [
     "Battle",

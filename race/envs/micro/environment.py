@@ -5,21 +5,22 @@ from typing import Any, ClassVar, final
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import UInt8
+from jaxtyping import Array, Int, Key, UInt8
 from numpy.typing import NDArray
 
-from race.envs.micro import Battle, load_map, make
+from race.envs.micro import Battle, load_map, make, smac
 from race.envs.micro.maps import MapSpec
 from race.envs.micro.recording import step_and_film, verdict_of
 from race.envs.micro.render import Painter, whole
-from race.envs.micro.scenario import Shape
-from race.envs.micro.smac import Info, Observation
+from race.envs.micro.scenario import Scenario, Shape
+from race.envs.micro.smac import Info
 from race.envs.micro.state import EnvState, Units
 from race.envs.micro.units import UNIT_TYPES
 from race.errors import RenderError, TaskError
-from race.types import DiscreteSpec, DiscreteTask
+from race.types import DeviceEnv, DiscreteSpec, DiscreteTask, Observation, Outcome
 
 STEPS_PER_SECOND = 2
 """At the game's "normal" speed."""
@@ -34,7 +35,24 @@ def make_task(task_id: str) -> DiscreteTask:
         TaskError: if there is no such map, or its file is wrong.
     """
     name = task_id.removeprefix("micro/")
-    return DiscreteTask(_sizes(task_id, load_map(name)), functools.partial(_make, name))
+    return DiscreteTask(
+        _sizes(task_id, load_map(name)),
+        functools.partial(_make, name),
+        functools.partial(_device, name),
+    )
+
+
+def _device(name: str) -> DeviceEnv:
+    return DeviceEnv(make(name).scenario, smac.reset, _device_step)
+
+
+def _device_step(
+    scenario: Scenario, env_state: EnvState, actions: Int[Any, "n"], key: Key[Array, ""]
+) -> tuple[EnvState, Observation, Outcome]:
+    env_state, timestep = smac.step(scenario, env_state, actions, key)
+    no = jnp.zeros((), bool)
+    outcome = Outcome(timestep.reward, timestep.terminated, no, timestep.info.battle_won)
+    return env_state, timestep.observation, outcome
 
 
 def _make(name: str, render_mode: str | None = None) -> gymnasium.Env[Any, Any]:
@@ -69,6 +87,7 @@ def _sizes(task_id: str, spec: MapSpec) -> DiscreteSpec:
         state_size=shape.state_size,
         n_actions=shape.n_actions,
         episode_limit=spec.episode_limit,
+        has_wins=True,
     )
 
 

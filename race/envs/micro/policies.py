@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from race.envs.micro import battle
 from race.envs.micro.scenario import Scenario
-from race.envs.micro.smac import Observation
 from race.envs.micro.state import EnvState
+from race.types import Observation
 
 Policy = Callable[[Scenario, EnvState, Observation, Key[Array, ""]], Int[Any, "n"]]
 

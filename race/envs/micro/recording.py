@@ -11,8 +11,9 @@ from jaxtyping import Array, Float, Int, Key
 from race.envs.micro import Battle, battle, smac
 from race.envs.micro.policies import Policy
 from race.envs.micro.scenario import Scenario
-from race.envs.micro.smac import Info, Observation, Timestep
+from race.envs.micro.smac import Info, Timestep
 from race.envs.micro.state import EnvState, Units
+from race.types import Observation
 
 
 class Recording(NamedTuple):

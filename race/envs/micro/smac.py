@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from race.envs.micro import battle
 from race.envs.micro.scenario import REWARD_DEATH, REWARD_WIN, Scenario
 from race.envs.micro.state import EnvState, Units, start
+from race.types import Observation
 
 SIGHT: Final = 9.0
 """Agents see units nearer than this, centre to centre, whatever their type."""
@@ -34,14 +35,6 @@ class View(NamedTuple):
     shield: Float[Any, "U"]
     energy: Float[Any, "U"]
     cooldown: Float[Any, "U"]
-
-
-class Observation(NamedTuple):
-    """What a step shows."""
-
-    obs: Float[Any, "n O"]
-    state: Float[Any, "S"]
-    avail_actions: Bool[Any, "n A"]
 
 
 class Info(NamedTuple):

@@ -24,8 +24,8 @@ from race.envs.micro.battle import (
 )
 from race.envs.micro.policies import Policy, focus_fire, random_actions
 from race.envs.micro.scenario import Scenario
-from race.envs.micro.smac import Observation
 from race.envs.micro.state import EnvState, Units, start
+from race.types import Observation
 
 CHUNK = 20
 DRAWS = 2000
