@@ -3,7 +3,9 @@
 import math
 from typing import Any
 
-from race.config import Config
+import numpy as np
+
+from race.config import Config, FacmacConfig
 from race.errors import ConfigError
 
 LARGEST_LAYER = 16_384
@@ -12,19 +14,30 @@ MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
 
 
+Rule = tuple[bool, str, Any, str]
+"""Whether it holds, the setting, its value, and what it must be."""
+
+
 def check(config: Config) -> None:
     """Checks every value of a configuration whose presets are filled in.
 
     Raises:
         ConfigError: naming the first setting that cannot work, and what would.
     """
-    learner, race = config.learner, config.race
+    learner, race, facmac = config.learner, config.race, config.facmac
+    assert config.evaluation.every is not None
+    assert config.evaluation.episodes is not None
+    if config.discrete and config.base != "facmac":
+        raise ConfigError(
+            f"{config.method} does not work on {config.task}: its actions are discrete, which "
+            "facmac alone learns to choose. Use --algo facmac, or --algo race with --base facmac."
+        )
     assert race.mutation_fraction is not None
     assert race.vmm_weight is not None
-    rules: list[tuple[bool, str, Any, str]] = [
+    rules: list[Rule] = [
         (1 <= config.env_steps < 2**31, "env-steps", config.env_steps, "from 1 to 2147483647"),
         (
-            config.env_steps > learner.random_steps,
+            config.discrete or config.env_steps > learner.random_steps,
             "env-steps",
             config.env_steps,
             f"more than the random steps before training (learner.random-steps "
@@ -44,6 +57,12 @@ def check(config: Config) -> None:
             for name, size in (
                 ("learner.hidden-sizes", max(learner.hidden_sizes)),
                 ("learner.batch-size", learner.batch_size),
+                ("facmac.mixer-size", facmac.mixer_size),
+                ("facmac.hypernet-size", facmac.hypernet_size),
+                ("facmac.hidden-size", facmac.hidden_size),
+                ("facmac.utility-sizes", max(facmac.utility_sizes)),
+                ("facmac.value-size", facmac.value_size),
+                ("facmac.batch-size", facmac.batch_size),
                 ("race.policy-embedding-size", race.policy_embedding_size),
                 ("race.mine-size", race.mine_size),
                 ("race.population-size", race.population_size),
@@ -108,6 +127,7 @@ def check(config: Config) -> None:
             learner.gradient_steps_per_env_step,
             "in (0, 100]",
         ),
+        *_facmac_rules(facmac),
         (
             race.population_size >= 4,
             "race.population-size",
@@ -163,3 +183,47 @@ def check(config: Config) -> None:
             raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
         if not holds:
             raise ConfigError(f"--{name} is {value}, but it must be {must}.")
+
+
+def _facmac_rules(facmac: FacmacConfig) -> list[Rule]:
+    sizes: dict[str, Any] = {
+        "mixer-size": facmac.mixer_size,
+        "hypernet-size": facmac.hypernet_size,
+        "hidden-size": facmac.hidden_size,
+        "utility-sizes": facmac.utility_sizes,
+        "value-size": facmac.value_size,
+        "target-update-every": facmac.target_update_every,
+        "epsilon-steps": facmac.epsilon_steps,
+    }
+    positive = {
+        "actor-learning-rate": facmac.actor_learning_rate,
+        "critic-learning-rate": facmac.critic_learning_rate,
+        "gradient-clip": facmac.gradient_clip,
+    }
+    shares = {
+        "td-lambda": facmac.td_lambda,
+        "epsilon-start": facmac.epsilon_start,
+        "epsilon-finish": facmac.epsilon_finish,
+    }
+    rules: list[Rule] = [
+        (np.min(size) >= 1, name, size, "at least 1") for name, size in sizes.items()
+    ]
+    rules += [(rate > 0, name, rate, "above 0") for name, rate in positive.items()]
+    rules += [(0 <= share <= 1, name, share, "in [0, 1]") for name, share in shares.items()]
+    rules += [
+        (facmac.batch_size >= 2, "batch-size", facmac.batch_size, "at least 2"),
+        (
+            facmac.batch_size <= facmac.replay_capacity <= MOST_TRANSITIONS,
+            "replay-capacity",
+            facmac.replay_capacity,
+            f"at least a minibatch (facmac.batch-size {facmac.batch_size})",
+        ),
+        (0 <= facmac.discount < 1, "discount", facmac.discount, "in [0, 1)"),
+        (
+            0 < facmac.gradient_steps_per_episode <= 100,
+            "gradient-steps-per-episode",
+            facmac.gradient_steps_per_episode,
+            "in (0, 100]",
+        ),
+    ]
+    return [(bool(holds), f"facmac.{name}", value, must) for holds, name, value, must in rules]

@@ -7,21 +7,22 @@ run and read back by every other command, so a run directory explains itself.
 import dataclasses
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
 from race.errors import ConfigError
 
-Algo = Literal["race", "matd3", "maddpg"]
-Base = Literal["matd3", "maddpg"]
+Algo = Literal["race", "matd3", "maddpg", "facmac"]
+Base = Literal["matd3", "maddpg", "facmac"]
 Preset = Literal["paper", "td3", "demo"]
+ReplayPrecision = Literal["float16", "float32"]
 TeamName = Literal["marl", "champion", "selected"]
 
 
 @dataclass(frozen=True)
 class LearnerConfig:
-    """The gradient learner (MATD3, MADDPG): the same with and without a population."""
+    """The gradient learner of continuous actions, with and without a population."""
 
     hidden_sizes: tuple[int, int] = (400, 300)
     """Units of the two layers of each encoder and critic (Table 1, Table 2)."""
@@ -54,15 +55,62 @@ class LearnerConfig:
 
 
 @dataclass(frozen=True)
+class FacmacConfig:
+    """FACMAC on discrete actions, where it is recurrent and learns from whole episodes.
+
+    On continuous actions its mixer is this one, and everything else as for the other learners.
+    """
+
+    mixer_size: int = 32
+    """Units of the monotonic mixing network."""
+    hypernet_size: int = 64
+    """Units of the hidden layers of the mixer's two-layer hypernetworks."""
+    hidden_size: int = 64
+    """Units of the encoder: of the layer before the GRU, and of the GRU."""
+    utility_sizes: tuple[int, int] = (64, 64)
+    """Units of the two layers of the agents' utilities."""
+    value_size: int = 32
+    """Units of the state-value net (Appendix A.1)."""
+    batch_size: int = 32
+    """Episodes in a minibatch."""
+    actor_learning_rate: float = 2.5e-3
+    """Adam step size of the encoder and the MARL team's head."""
+    critic_learning_rate: float = 5e-4
+    """Adam step size of utilities, mixers, the state-value net and MINE."""
+    gradient_clip: float = 10.0
+    """Largest norm of a gradient: of the encoder, of the head, of utilities and mixer together."""
+    discount: float = 0.99
+    """Discount factor, the paper's gamma."""
+    td_lambda: float = 0.8
+    """Lambda of the targets: 0 looks one step ahead, 1 to the end of the episode."""
+    target_update_every: int = 200
+    """Gradient steps after which targets become copies of the networks."""
+    epsilon_start: float = 0.5
+    """Share of the MARL team's actions that are random, at the beginning."""
+    epsilon_finish: float = 0.05
+    """The same in the end."""
+    epsilon_steps: int = 50_000
+    """Environment steps from the one to the other."""
+    replay_capacity: int = 5_000
+    """Episodes that the replay buffer holds."""
+    replay_precision: ReplayPrecision = "float16"
+    """What observations and states are stored as; float32 takes twice the memory."""
+    gradient_steps_per_episode: float = 1.0
+    """Gradient steps for each episode collected, from the first full minibatch on."""
+
+
+@dataclass(frozen=True)
 class RaceConfig:
     """The population, its evolution and the shared encoder's losses (Section 3, Tables 2, 3)."""
 
     population_size: int = 5
     """Teams of the population, the paper's n."""
     mutation_fraction: float | None = None
-    """Share of a picked head's weights that mutate, the paper's alpha. None: Table 3, else 0.5."""
+    """Share of a picked head's weights that mutate, the paper's alpha. None: Tables 3 and 4, else
+    0.5, on tasks with discrete actions 0.05."""
     vmm_weight: float | None = None
-    """Weight of Value-Aware MI Maximization, the paper's beta. None: Table 3, else 0.01."""
+    """Weight of Value-Aware MI Maximization, the paper's beta. None: Tables 3 and 4, else
+    0.01."""
     mutation_probability: float = 0.9
     """Probability that a team that is not the elite mutates."""
     agent_mutation_probability: float = 0.5
@@ -114,10 +162,11 @@ class EnvConfig:
 class EvaluationConfig:
     """Test episodes during training, without exploration noise."""
 
-    every: int = 5_000
-    """Environment steps between evaluations (at the next end of a generation)."""
-    episodes: int = 10
-    """Episodes per team and evaluation."""
+    every: int | None = None
+    """Environment steps between evaluations (at the next end of a generation). None: 5,000, on
+    tasks with discrete actions 10,000."""
+    episodes: int | None = None
+    """Episodes per team and evaluation. None: 10, on tasks with discrete actions 32."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +185,12 @@ class Config:
 
     task: str
     algo: Algo = "race"
-    base: Base = "matd3"
+    base: Base | None = None  # until presets are filled in
+    discrete: bool = False
     seed: int = 1
     env_steps: int = 1_000_000
     learner: LearnerConfig = field(default_factory=LearnerConfig)
+    facmac: FacmacConfig = field(default_factory=FacmacConfig)
     race: RaceConfig = field(default_factory=RaceConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -151,9 +202,24 @@ class Config:
         return self.algo == "race"
 
     @property
+    def n_teams(self) -> int:
+        """Teams that act: the population and the MARL team."""
+        return self.race.population_size + 1 if self.has_population else 1
+
+    @property
     def method(self) -> str:
         """The method's name as figures show it, such as ``RACE(MATD3)``."""
-        return f"RACE({self.base.upper()})" if self.algo == "race" else self.algo.upper()
+        return f"RACE({str(self.base).upper()})" if self.algo == "race" else self.algo.upper()
+
+    @property
+    def hyper(self) -> LearnerConfig | FacmacConfig:
+        """The settings of the learner on this kind of task."""
+        return self.facmac if self.discrete else self.learner
+
+    @property
+    def policy_delay(self) -> int:
+        """Critic steps per policy step."""
+        return 1 if self.discrete else self.learner.policy_delay
 
 
 def to_json(config: Any) -> dict[str, Any]:
@@ -161,8 +227,12 @@ def to_json(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+# What runs of older versions do not have in their files: settings of tasks they could not train on.
+_LATER = frozenset({"facmac", "discrete"})
+
+
 def from_json(data: dict[str, Any]) -> Config:
-    """Reads back what `to_json` wrote.
+    """Reads back what `to_json` wrote, also that of a version without discrete actions.
 
     Raises:
         ConfigError: if a field is missing, unknown or of the wrong kind.
@@ -173,7 +243,7 @@ def from_json(data: dict[str, Any]) -> Config:
 def _build(cls: Any, data: Any) -> Any:
     hints = get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}
-    if not isinstance(data, dict) or set(data) != names:
+    if not isinstance(data, dict) or set(data) | (_LATER & names) != names:
         found = sorted(data) if isinstance(data, dict) else data
         raise ConfigError(
             f"The saved configuration does not fit this version of race: {cls.__name__} has the "
@@ -201,7 +271,7 @@ def _fits(value: Any, hint: Any) -> bool:
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return value in arguments
-    if origin is UnionType:
+    if origin in (UnionType, Union):
         return any(_fits(value, argument) for argument in arguments)
     if origin is tuple:
         if not isinstance(value, tuple):

@@ -1,5 +1,7 @@
 """Central critics: the MARL critic, the PeVFA (a critic with a policy embedding), state values."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -132,21 +134,26 @@ def first_pevfa(pevfa: Pevfa) -> Pevfa:
 class StateValue(eqx.Module):
     """The state-value network ``V_zeta(s)`` (Appendix A.1)."""
 
-    layers: tuple[Dense, Dense, Dense]
+    layers: tuple[Dense, ...]
 
 
-def init_state_value(key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, int]) -> StateValue:
+def init_state_value(
+    key: PRNGKeyArray, state_size: int, hidden_sizes: tuple[int, ...]
+) -> StateValue:
     """A fresh state-value network."""
-    h1, h2 = hidden_sizes
-    k1, k2, k3 = jax.random.split(key, 3)
-    return StateValue(
-        (init_dense(k1, spec.state_size, h1), init_dense(k2, h1, h2), init_dense(k3, h2, 1))
-    )
+    sizes = (state_size, *hidden_sizes, 1)
+    keys = jax.random.split(key, len(sizes) - 1)
+    return StateValue(tuple(map(init_dense, keys, sizes[:-1], sizes[1:])))
 
 
-def state_values(network: StateValue, state: Float[Array, "B S"]) -> Float[Array, "B"]:
+def state_values(
+    network: StateValue,
+    state: Float[Array, "B S"],
+    activation: Callable[[Array], Array] = jax.nn.leaky_relu,
+) -> Float[Array, "B"]:
     """``V_zeta(s)``."""
-    first, second, out = network.layers
-    x = jax.nn.leaky_relu(first(state))
-    x = jax.nn.leaky_relu(second(x))
+    *hidden, out = network.layers
+    x = state
+    for layer in hidden:
+        x = activation(layer(x))
     return out(x)[:, 0]

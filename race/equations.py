@@ -3,6 +3,9 @@
 Shapes are those of one batch; every function can be jitted and vmapped. None of them stops a
 gradient: which parameters an equation trains is decided where it is used, by what is
 differentiated. Symbols are the paper's.
+
+A batch of whole episodes holds padding behind their ends. ``mask`` is 1 for its real samples and 0
+for padding, and every expectation E_D is over the real ones; None, where all samples are real.
 """
 
 import jax
@@ -10,6 +13,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 Scalar = Float[Array, ""]
+Mask = Float[Array, "B"] | None
+
+
+def expectation(values: Float[Array, "*k B"], mask: Mask = None) -> Float[Array, "*k"]:
+    """``E_D``: the mean over the real samples of a batch."""
+    if mask is None:
+        return jnp.mean(values, axis=-1)
+    # A sum of products would spread a NaN of the padding to everything.
+    real = jnp.where(mask > 0, values, 0.0)
+    return jnp.sum(real, axis=-1) / jnp.sum(mask)
 
 
 def td_target(
@@ -30,27 +43,28 @@ def td_target(
     return reward + discount * (1.0 - terminated) * next_value
 
 
-def td_loss(value: Float[Array, "K B"], target: Float[Array, "B"]) -> Scalar:
+def td_loss(value: Float[Array, "K B"], target: Float[Array, "B"], mask: Mask = None) -> Scalar:
     """Eq. (1): ``E_D[(y - Q(s, u))^2]``, summed over the K critics of an ensemble.
 
     L_psi with Q_psi of the MARL critic, L_theta with Q_theta of the PeVFA.
     """
-    return jnp.sum(jnp.mean(jnp.square(value - target[None]), axis=1))
+    return jnp.sum(expectation(jnp.square(value - target[None]), mask))
 
 
 def value_function_maximization_loss(
-    marl_value: Float[Array, "B"], team_value: Float[Array, "B"]
+    marl_value: Float[Array, "B"], team_value: Float[Array, "B"], mask: Mask = None
 ) -> Scalar:
     """Eq. (2): ``L_VFM = -E[Q_psi(s, pi_marl(s)) + Q_theta(s, pi_j(s), W_j)]``.
 
     Args:
         marl_value: ``Q_psi(s, pi_marl(s))``, the MARL critic of the MARL team's actions.
         team_value: ``Q_theta(s, pi_j(s), W_j)``, the PeVFA of a population team's actions.
+        mask: of the samples.
     """
-    return -jnp.mean(marl_value + team_value)
+    return -expectation(marl_value + team_value, mask)
 
 
-def mutual_information_signal(scores: Float[Array, "B B"]) -> Float[Array, "B"]:
+def mutual_information_signal(scores: Float[Array, "B B"], mask: Mask = None) -> Float[Array, "B"]:
     """The per-step signal ``I_t(z_t, s_t)`` below Eq. (3).
 
     ``I_t = -sp(-T(s_t, z_t)) - E_{k != t}[sp(T(s_t, z_k))]`` with ``sp(x) = log(1 + exp(x))``.
@@ -58,17 +72,21 @@ def mutual_information_signal(scores: Float[Array, "B B"]) -> Float[Array, "B"]:
 
     Args:
         scores: ``T_omega(s_t, z_k)``, row t the state, column k the embedding; B at least 2.
+        mask: of the samples. Where it leaves fewer than two, there is no second term.
     """
-    n = scores.shape[0]
     paired = jnp.diagonal(scores)
     negative = jax.nn.softplus(scores)
-    unpaired = jnp.sum(negative, axis=1) - jnp.diagonal(negative)
-    return -jax.nn.softplus(-paired) - unpaired / (n - 1)
+    if mask is None:
+        unpaired = jnp.sum(negative, axis=1) - jnp.diagonal(negative)
+        return -jax.nn.softplus(-paired) - unpaired / (scores.shape[0] - 1)
+    others = mask[None] * (1.0 - jnp.eye(scores.shape[0], dtype=mask.dtype))
+    unpaired = jnp.sum(others * negative, axis=1) / jnp.maximum(jnp.sum(others, axis=1), 1.0)
+    return -jax.nn.softplus(-paired) - unpaired
 
 
-def mutual_information_bound(scores: Float[Array, "B B"]) -> Scalar:
+def mutual_information_bound(signal: Float[Array, "B"], mask: Mask = None) -> Scalar:
     """Eq. (3): the lower bound ``I_lb(z; s)``, the mean of the per-step signals."""
-    return jnp.mean(mutual_information_signal(scores))
+    return expectation(signal, mask)
 
 
 def best_target(
@@ -82,24 +100,30 @@ def best_target(
     return jnp.maximum(marl_target, team_target)
 
 
-def state_value_loss(value: Float[Array, "B"], target: Float[Array, "B"]) -> Scalar:
+def state_value_loss(
+    value: Float[Array, "B"], target: Float[Array, "B"], mask: Mask = None
+) -> Scalar:
     """Eq. (4): ``L_zeta = E_D[(V_zeta(s) - F(s))^2]``."""
-    return jnp.mean(jnp.square(value - target))
+    return expectation(jnp.square(value - target), mask)
 
 
-def value_weights(value: Float[Array, "B"]) -> Float[Array, "B"]:
-    """The min-max normalised state values of Eq. (5), in [0, 1].
+def value_weights(value: Float[Array, "B"], mask: Mask = None) -> Float[Array, "B"]:
+    """The min-max normalised state values of Eq. (5), in [0, 1] where samples are real.
 
     Equal values, for which the paper's fraction is 0/0, all get weight 0.
     """
-    low, high = jnp.min(value), jnp.max(value)
+    real = None if mask is None else mask > 0
+    low = jnp.min(value, where=real, initial=jnp.inf)
+    high = jnp.max(value, where=real, initial=-jnp.inf)
     spread = high - low
     return (value - low) / jnp.where(spread > 0, spread, jnp.ones_like(spread))
 
 
-def value_aware_mi_loss(weights: Float[Array, "B"], signal: Float[Array, "B"]) -> Scalar:
+def value_aware_mi_loss(
+    weights: Float[Array, "B"], signal: Float[Array, "B"], mask: Mask = None
+) -> Scalar:
     """Eq. (5): ``L_VMM = -E_D[w(s_t) I_t(z_t, s_t)]`` with the weights of `value_weights`."""
-    return -jnp.mean(weights * signal)
+    return -expectation(weights * signal, mask)
 
 
 def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: float) -> Scalar:
@@ -107,6 +131,6 @@ def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: float) -> Scalar:
     return vfm + vmm_weight * vmm
 
 
-def marl_policy_loss(marl_value: Float[Array, "B"]) -> Scalar:
+def marl_policy_loss(marl_value: Float[Array, "B"], mask: Mask = None) -> Scalar:
     """Eq. (7): ``L_MARL(W_marl) = -E_D[Q_psi(s, pi_marl(s))]``."""
-    return -jnp.mean(marl_value)
+    return -expectation(marl_value, mask)

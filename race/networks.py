@@ -82,6 +82,12 @@ def init_head(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int) -> Float[Ar
     return head * jnp.asarray(spec.action_mask, head.dtype)[:, None, :]
 
 
+def init_one_head(key: PRNGKeyArray, embedding_size: int, actions: int) -> Float[Array, "H1 A"]:
+    """One agent's linear policy representation."""
+    bound = 1.0 / np.sqrt(embedding_size)
+    return jax.random.uniform(key, (embedding_size + 1, actions), minval=-bound, maxval=bound)
+
+
 def act(
     z: Float[Array, "N B H"], head: Float[Array, "N H1 A"], spec: EnvSpec
 ) -> Float[Array, "B U"]:
@@ -145,17 +151,18 @@ class Mine(eqx.Module):
 
 def init_mine(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int, size: int) -> Mine:
     """One fresh network per agent."""
-    agents = []
-    for agent_key in jax.random.split(key, spec.n_agents):
-        k1, k2, k3 = jax.random.split(agent_key, 3)
-        agents.append(
-            Mine(
-                init_dense(k1, spec.state_size, size),
-                init_dense(k2, size, size),
-                init_dense(k3, embedding_size, size),
-            )
-        )
-    return stack(agents)
+    keys = jax.random.split(key, spec.n_agents)
+    return stack([init_one_mine(k, spec.state_size, embedding_size, size) for k in keys])
+
+
+def init_one_mine(key: PRNGKeyArray, state_size: int, embedding_size: int, size: int) -> Mine:
+    """A fresh network, not stacked."""
+    k1, k2, k3 = jax.random.split(key, 3)
+    return Mine(
+        init_dense(k1, state_size, size),
+        init_dense(k2, size, size),
+        init_dense(k3, embedding_size, size),
+    )
 
 
 def mine_scores(

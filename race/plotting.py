@@ -24,8 +24,17 @@ FORMATS = (".png", ".svg", ".pdf")
 TEAMS = ("selected", "marl", "champion")
 
 # The paper's colours where it has any.
-_COLOURS = {"RACE(MATD3)": "#d62728", "MATD3": "#222222", "MADDPG": "#1f77b4"}
-_OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#8c564b", "#e377c2")
+_COLOURS = {
+    "RACE(MATD3)": "#d62728",
+    "MATD3": "#222222",
+    "MADDPG": "#1f77b4",
+    "RACE(FACMAC)": "#e377c2",
+    "FACMAC": "#8c564b",
+}
+# Where discrete actions leave only these two, they have the colours of the paper's other figure.
+_DISCRETE_COLOURS = {"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"}
+_OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#17becf", "#bcbd22")
+_AXES = {"return_mean": "test return", "win_rate": "test win rate"}
 _LINES = {"selected": "-", "marl": "--", "champion": ":"}
 _LABELS = {"selected": "selected team", "marl": "MARL team", "champion": "champion"}
 
@@ -65,8 +74,8 @@ def plot(
     Args:
         directories: run directories, or folders of run directories.
         out: a .png, .svg or .pdf file.
-        metric: a quantity of evaluations (``return_mean``: that of ``team``), or any key in
-            ``metrics.jsonl``, such as ``injection/elite_rate``.
+        metric: a quantity of evaluations (``return_mean``, ``win_rate``: of ``team``), or any key
+            in ``metrics.jsonl``, such as ``injection/elite_rate``.
         team: ``selected``, ``marl``, ``champion``, or ``all`` of them.
 
     Returns:
@@ -227,9 +236,10 @@ def _panel(
     found = []
     spare = iter(_OTHER_COLOURS * 4)
     colours: dict[str, str] = {}
+    known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
     for (method, name), runs in sorted(methods.items(), reverse=True):
         if method not in colours:
-            colours[method] = _COLOURS.get(method) or next(spare)
+            colours[method] = known.get(method) or next(spare)
         band = aggregate(runs)
         if not band.env_steps.size:
             raise RaceError(
@@ -264,7 +274,9 @@ def _panel(
         )
     axes.set_title(task)
     axes.set_xlabel("environment steps (all teams)")
-    axes.set_ylabel({"return_mean": "test return"}.get(metric, metric))
+    axes.set_ylabel(_AXES.get(metric, metric))
+    if metric == "win_rate":
+        axes.set_ylim(-0.02, 1.02)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k")

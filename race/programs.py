@@ -14,8 +14,8 @@ from race.algorithms.base import Losses, Teams
 from race.config import Config
 from race.learners import LEARNERS
 from race.networks import act_teams
-from race.replay import Replay, insert, sample
-from race.types import EnvSpec, Transition
+from race.replay import Replay, distinct_places, episodes_at, insert, sample
+from race.types import EnvSpec, Spec
 
 TRACES: Counter[str] = Counter()
 """How often each program was traced in this process: one more than expected is a slow surprise."""
@@ -31,7 +31,9 @@ def empty_losses(algorithm: Algorithm) -> Losses:
 
 
 @partial(
-    jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames=("state", "sums")
+    jax.jit,
+    static_argnames=("algorithm", "spec", "config", "steps"),
+    donate_argnames=("state", "sums"),
 )
 def learn(
     state: Any,
@@ -42,13 +44,14 @@ def learn(
     n_steps: Int[Array, ""],
     *,
     algorithm: Algorithm,
-    spec: EnvSpec,
+    spec: Spec,
     config: Config,
+    steps: int = 0,
 ) -> tuple[Any, Losses]:
     """Gradient steps ``first_step`` to ``first_step + n_steps - 1`` of a run, in one program.
 
     The randomness of a step depends on ``key`` and the step's number alone, so that steps may be
-    split over calls in any way.
+    split over calls in any way. Minibatches of episodes are cut to ``steps`` steps.
 
     Returns:
         The state and ``sums`` with the steps' losses added.
@@ -59,12 +62,36 @@ def learn(
         state, sums = carry
         step = first_step + i
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, step))
-        batch = sample(replay, config.learner.batch_size, sample_key)
+        if config.discrete:
+            places = distinct_places(replay, config.facmac.batch_size, sample_key)
+            batch = episodes_at(replay, places, steps)
+        else:
+            batch = sample(replay, config.learner.batch_size, sample_key)
         state, critic, policy = algorithm.update(state, batch, step, update_key, spec, config)
         losses = critic | policy
         return state, {name: sums[name] + losses[name] for name in sums}
 
     return jax.lax.fori_loop(0, n_steps, body, (state, sums))
+
+
+@partial(jax.jit, static_argnames="config")
+def longest(
+    replay: Replay,
+    key: PRNGKeyArray,
+    first_step: Int[Array, ""],
+    n_steps: Int[Array, ""],
+    *,
+    config: Config,
+) -> Int[Array, ""]:
+    """Steps of the longest episode that `learn` will draw for some gradient steps."""
+    TRACES["longest"] += 1
+
+    def body(i: Int[Array, ""], found: Int[Array, ""]) -> Int[Array, ""]:
+        sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
+        places = distinct_places(replay, config.facmac.batch_size, sample_key)
+        return jnp.maximum(found, jnp.max(replay.data.length[places]))
+
+    return jax.lax.fori_loop(0, n_steps, body, jnp.zeros((), jnp.int32))
 
 
 @partial(jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames="state")
@@ -74,7 +101,7 @@ def evolve(
     key: PRNGKeyArray,
     *,
     algorithm: Algorithm,
-    spec: EnvSpec,
+    spec: Spec,
     config: Config,
 ) -> Any:
     """One evolution of the population."""
@@ -83,23 +110,28 @@ def evolve(
 
 
 @partial(jax.jit, donate_argnames="replay")
-def store(replay: Replay, rows: Transition, count: Int[Array, ""]) -> Replay:
-    """Writes up to `INSERT_ROWS` transitions."""
+def store(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
+    """Writes the first ``count`` of some transitions or episodes."""
     TRACES["store"] += 1
     return insert(replay, rows, count)
 
 
 @partial(jax.jit, static_argnames=("spec", "base"))
 def act(
-    teams: Teams, state: Float[Array, "T S"] | Float[np.ndarray, "T S"], *, spec: EnvSpec, base: str
+    teams: Teams,
+    state: Float[Array, "T S"] | Float[np.ndarray, "T S"],
+    *,
+    spec: EnvSpec,
+    base: str,
 ) -> Float[Array, "T U"]:
     """The joint actions of all teams, each in its own state: one batched call per tick."""
     TRACES["act"] += 1
-    return act_teams(LEARNERS[base].encode(teams.encoder, spec, state), teams.heads, spec)
+    learner = LEARNERS[base]
+    return act_teams(learner.encode(teams.encoder, state, spec), teams.heads, spec)
 
 
 @partial(jax.jit, static_argnames=("algorithm", "spec", "config"))
-def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: EnvSpec, config: Config) -> Any:
+def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: Spec, config: Config) -> Any:
     """The state of an algorithm before its first step."""
     TRACES["start"] += 1
     return algorithm.init(key, spec, config)

@@ -7,7 +7,7 @@ import numpy as np
 
 from race.algorithms import Algorithm
 from race.config import Config
-from race.evaluation import Score
+from race.rollouts.base import Score
 from race.run_state import Progress, RunState
 
 
@@ -19,7 +19,7 @@ def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dic
     """
     progress = state.progress
     steps = progress.gradient_steps - progress.gradient_steps_before
-    delay = config.learner.policy_delay
+    delay = config.policy_delay
     policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
     row: dict[str, Any] = {"kind": "generation", **_counters(progress)}
     row["marl/return"] = progress.marl_return
@@ -41,7 +41,7 @@ def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dic
 
 
 def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str, Any]:
-    """Test returns of the MARL team, the champion, and the one of them that is selected.
+    """Test results of the MARL team, the champion, and the one of them that is selected.
 
     Selected is the one with the better training return: no test result has a say in it.
     """
@@ -50,6 +50,8 @@ def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str,
         row[f"eval/{name}/return_mean"] = score.mean
         row[f"eval/{name}/return_std"] = score.std
         row[f"eval/{name}/length_mean"] = float(score.lengths.mean())
+        if score.win_rate is not None:
+            row[f"eval/{name}/win_rate"] = score.win_rate
     return row
 
 

@@ -10,10 +10,10 @@ from race.config import Config
 from race.errors import DivergenceError
 from race.interrupts import Interrupts
 from race.metrics import MetricsWriter
-from race.rollouts.host import EnvPool
+from race.rollouts import Rollouts
 from race.run_directory import RunDirectory
-from race.run_state import Progress, RunState, statics, to_arrays
-from race.types import Task
+from race.run_state import Progress, RunState, segment_rows, statics, to_arrays
+from race.types import AnyTask
 
 Report = Callable[[str, Progress, dict[str, Any]], None]
 """Told what is going on: the stage, the progress, and the newest row of metrics."""
@@ -28,11 +28,10 @@ class Run:
     """What does not change during a run, and its resources."""
 
     config: Config
-    task: Task
+    task: AnyTask
     algorithm: Algorithm
     directory: RunDirectory
-    pool: EnvPool  # one environment per acting team
-    test_pool: EnvPool
+    rollouts: Rollouts
     metrics: MetricsWriter
     interrupts: Interrupts
     report: Report
@@ -55,7 +54,7 @@ def save(run: Run, state: RunState) -> RunState:
         raise DivergenceError(
             "A network's parameters are no longer finite numbers, though its last loss was. Start "
             "a new run with smaller learning rates (--learner.actor-learning-rate, "
-            "--learner.critic-learning-rate)."
+            "--learner.critic-learning-rate, or of --facmac)."
         )
     run.metrics.sync()
     progress = state.progress.but(metrics_offset=run.metrics.offset)
@@ -64,6 +63,12 @@ def save(run: Run, state: RunState) -> RunState:
     name = f"step-{progress.env_steps:012d}"
     run.report("saving", progress, {})
     checkpoints.save(
-        run.directory.checkpoints, name, arrays, info, rows, run.config.checkpoint.keep
+        run.directory.checkpoints,
+        name,
+        arrays,
+        info,
+        rows,
+        run.config.checkpoint.keep,
+        segment_rows(state.replay),
     )
     return state

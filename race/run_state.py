@@ -2,36 +2,25 @@
 
 import dataclasses
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PRNGKeyArray
-from numpy.typing import NDArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses
-from race.checkpoints import Checkpoint, Rows
+from race.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
 from race.config import Config
 from race.errors import CheckpointError
 from race.optimization import copy
-from race.programs import INSERT_ROWS, empty_losses, start
-from race.replay import Replay, init_replay
+from race.programs import empty_losses, start
+from race.randomness import Purpose, root_key
+from race.replay import Replay
 from race.trees import flatten, restore
-from race.types import EnvSpec, Transition
+from race.types import Spec
 
-
-class Purpose(IntEnum):
-    """What randomness is for. Every use has its own stream, numbered by a counter of the run."""
-
-    INIT = 0
-    WARM_UP = 1
-    ROLLOUT = 2
-    EVOLUTION = 3
-    LEARNING = 4
-    EVALUATION = 5
+SEGMENT_BYTES = 2**26
 
 
 @dataclass(frozen=True)
@@ -43,6 +32,8 @@ class Progress:
     random_steps: int = 0
     """Steps of the warm-up."""
     gradient_steps: int = 0
+    episodes: int = 0
+    """Episodes of all teams, without those of the warm-up."""
     generation: int = 0
     """Generations begun."""
     learning: bool = False
@@ -85,29 +76,7 @@ class RunState(NamedTuple):
     progress: Progress
 
 
-def n_teams(config: Config) -> int:
-    """Teams that act: the population and the MARL team."""
-    return config.race.population_size + 1 if config.has_population else 1
-
-
-def root_key(config: Config, purpose: Purpose) -> PRNGKeyArray:
-    """The random key of one purpose."""
-    return jax.random.fold_in(jax.random.key(config.seed), int(purpose))
-
-
-def host_seeds(config: Config, purpose: Purpose, index: int, count: int) -> NDArray[np.int64]:
-    """Seeds for environments, from the run's seed, the purpose and a counter."""
-    sequence = np.random.SeedSequence((config.seed, int(purpose), index))
-    return sequence.generate_state(count).astype(np.int64)
-
-
-def replay_rows(config: Config, spec: EnvSpec) -> int:
-    """Transitions to make room for: a short run does not pay for a long one's memory."""
-    longest = config.learner.random_steps + config.env_steps + n_teams(config) * spec.episode_limit
-    return min(config.learner.replay_capacity, max(longest, INSERT_ROWS))
-
-
-def statics(config: Config, spec: EnvSpec, algorithm: Algorithm) -> dict[str, Any]:
+def statics(config: Config, spec: Spec, algorithm: Algorithm) -> dict[str, Any]:
     """The static arguments of the compiled programs.
 
     What no program reads is set to one value, so that runs that differ in it alone share programs.
@@ -124,13 +93,13 @@ def statics(config: Config, spec: EnvSpec, algorithm: Algorithm) -> dict[str, An
     return {"algorithm": algorithm, "spec": spec, "config": shared}
 
 
-def fresh(config: Config, spec: EnvSpec, algorithm: Algorithm) -> RunState:
-    """The state before the first step."""
+def fresh(config: Config, spec: Spec, algorithm: Algorithm, replay: Replay) -> RunState:
+    """The state before the first step, with an empty buffer."""
     key = root_key(config, Purpose.INIT)
     return RunState(
         algorithm=copy(start(key, **statics(config, spec, algorithm))),
         losses=empty_losses(algorithm),
-        replay=init_replay(spec, replay_rows(config, spec)),
+        replay=replay,
         progress=Progress(),
     )
 
@@ -144,22 +113,28 @@ def to_arrays(state: RunState) -> tuple[dict[str, Any], dict[str, Any], dict[str
     return arrays, {"progress": dataclasses.asdict(state.progress)}, {"replay": rows}
 
 
+def segment_rows(replay: Replay) -> int:
+    """Items of a file of a checkpoint: of transitions many, of episodes about 64 MB."""
+    item = sum(leaf.nbytes // leaf.shape[0] for leaf in jax.tree.leaves(replay.data))
+    return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // item))
+
+
 def from_checkpoint(
-    saved: Checkpoint, config: Config, spec: EnvSpec, algorithm: Algorithm
+    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm, replay: Replay
 ) -> RunState:
-    """The state that a checkpoint holds.
+    """The state that a checkpoint holds; ``replay`` is an empty buffer of the run.
 
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.
     """
     progress = progress_of(saved)
     trained = learned_of(saved, config, spec, algorithm)
-    replay = _replay(saved, config, spec)
-    return RunState(trained["algorithm"], trained["losses"], replay, progress)
+    filled = _filled(saved, replay)
+    return RunState(trained["algorithm"], trained["losses"], filled, progress)
 
 
 def learned_of(
-    saved: Checkpoint, config: Config, spec: EnvSpec, algorithm: Algorithm
+    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm
 ) -> dict[str, Any]:
     """The algorithm's state and the loss sums that a checkpoint holds.
 
@@ -191,24 +166,23 @@ def progress_of(saved: Checkpoint) -> Progress:
     return Progress(**{**values, "fitness": tuple(values["fitness"])})
 
 
-def _replay(saved: Checkpoint, config: Config, spec: EnvSpec) -> Replay:
+def _filled(saved: Checkpoint, replay: Replay) -> Replay:
+    """The buffer with what the checkpoint holds."""
     if "replay" not in saved.rows:
         raise CheckpointError(f"The checkpoint {saved.path} holds no replay buffer.")
-    rows = saved.rows["replay"]
-    capacity = replay_rows(config, spec)
+    rows, capacity = saved.rows["replay"], replay.capacity
     if rows.size > capacity or rows.inserted > rows.capacity != capacity:
         raise CheckpointError(
-            f"The checkpoint {saved.path} holds a replay buffer of {rows.capacity} transitions, "
+            f"The checkpoint {saved.path} holds a replay buffer of {rows.capacity} items, "
             f"which does not go into the {capacity} that config.json asks for. Put "
-            "learner.replay_capacity back to what the run began with."
+            "replay_capacity back to what the run began with."
         )
-    shapes = jax.eval_shape(lambda: init_replay(spec, capacity)).data
     columns = {}
-    for name, column in shapes._asdict().items():
+    for name, column in replay.data._asdict().items():
         kept = rows.columns.get(name)
         if kept is None or kept.shape[1:] != column.shape[1:] or kept.dtype != column.dtype:
             raise CheckpointError(
-                f"The checkpoint {saved.path} holds transitions of another task: its replay "
+                f"The checkpoint {saved.path} holds experience of another task: its replay "
                 f"column {name} does not fit. Is config.json the one that the run began with?"
             )
         if rows.capacity != capacity:
@@ -216,4 +190,4 @@ def _replay(saved: Checkpoint, config: Config, spec: EnvSpec) -> Replay:
             larger[: rows.size] = kept[: rows.size]
             kept = larger
         columns[name] = jnp.array(kept)
-    return Replay(Transition(**columns), jnp.asarray(rows.inserted, jnp.int32))
+    return Replay(replay.data._replace(**columns), jnp.asarray(rows.inserted, jnp.int32))

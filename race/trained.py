@@ -17,14 +17,14 @@ from race.errors import ConfigError, RunDirectoryError
 from race.programs import act
 from race.run_directory import RunDirectory
 from race.run_state import Progress, learned_of, progress_of
-from race.types import Task
+from race.types import AnyTask, Task
 
 
 class Trained(NamedTuple):
     """The teams of a run's newest checkpoint."""
 
     config: Config
-    task: Task
+    task: AnyTask
     progress: Progress
     encoder: Any
     heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and, with a population, "champion"
@@ -44,9 +44,13 @@ class Trained(NamedTuple):
         return name
 
     def policy(self, team: TeamName) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
-        """The team as a function from a state [S] to a joint action [U] in [-1, 1]."""
+        """The team as a function from a state [S] to a joint action [U] in [-1, 1].
+
+        For tasks with continuous actions.
+        """
+        assert isinstance(self.task, Task), "recurrent teams need more than the state"
         teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
-        spec, base = self.task.spec, self.config.base
+        spec, base = self.task.spec, str(self.config.base)
 
         def choose(state: NDArray[np.float32]) -> NDArray[np.float32]:
             return np.asarray(act(teams, state[None], spec=spec, base=base))[0]
@@ -71,5 +75,5 @@ def load_trained(path: Path) -> Trained:
     saved = checkpoints.load(newest, tables=False)
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
-    encoder, heads = tested_teams(algorithm, state, config.has_population)
+    encoder, heads = tested_teams(algorithm, state, task.spec, config.has_population)
     return Trained(config, task, progress_of(saved), encoder, heads)

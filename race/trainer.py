@@ -18,10 +18,10 @@ from race.errors import ConfigError, DivergenceError
 from race.generation import generation, warm_up
 from race.interrupts import Interrupts
 from race.metrics import MetricsWriter
-from race.rollouts.host import EnvPool
+from race.rollouts import rollouts_of
 from race.run import Report, Run, save, silent
 from race.run_directory import RunDirectory
-from race.run_state import Progress, RunState, fresh, from_checkpoint, n_teams
+from race.run_state import Progress, RunState, fresh, from_checkpoint
 
 
 def train(
@@ -52,19 +52,19 @@ def train(
     report("preparing the task", Progress(), {})
     task = make_task(config.task, config.env)
     with run_directory.lock(path):
-        newest = checkpoints.newest(directory.checkpoints)
+        rollouts = rollouts_of(config, task)
+        newest, replay = checkpoints.newest(directory.checkpoints), rollouts.empty_replay()
         if newest is None:
-            state = fresh(config, task.spec, algorithm)
+            state = fresh(config, task.spec, algorithm, replay)
         else:
-            state = from_checkpoint(checkpoints.load(newest), config, task.spec, algorithm)
+            saved = checkpoints.load(newest)
+            state = from_checkpoint(saved, config, task.spec, algorithm, replay)
+        del replay
         if not _must_go_on(path, config, extend, state.progress):
             run_directory.mark_finished(path)
             return state.progress
-        n_tests = config.evaluation.episodes * (2 if config.has_population else 1)
-        processes = config.env.processes
         with (
-            EnvPool(task, n_teams(config), processes) as pool,
-            EnvPool(task, n_tests, processes) as test_pool,
+            rollouts,
             MetricsWriter(directory.metrics, state.progress.metrics_offset) as metrics,
             Interrupts() as interrupts,
         ):
@@ -78,8 +78,7 @@ def train(
                 task=task,
                 algorithm=algorithm,
                 directory=directory,
-                pool=pool,
-                test_pool=test_pool,
+                rollouts=rollouts,
                 metrics=metrics,
                 interrupts=interrupts,
                 report=report,

@@ -50,7 +50,7 @@ def tiny_config() -> Callable[..., Any]:
     Targets are not smoothed and gradients not clipped, so that losses can be worked out; all
     teams enter the tournament, so that fates can be scripted.
     """
-    from race.config import Config, LearnerConfig, RaceConfig
+    from race.config import Config, FacmacConfig, LearnerConfig, RaceConfig
     from race.presets import resolve
 
     def make(
@@ -75,6 +75,7 @@ def tiny_config() -> Callable[..., Any]:
                 algo=algo if algo == "race" else base,  # type: ignore[arg-type]
                 base=base,  # type: ignore[arg-type]
                 learner=dataclasses.replace(learner_config, **(learner or {})),
+                facmac=FacmacConfig(mixer_size=3, hypernet_size=4),
                 race=dataclasses.replace(race_config, **(race or {})),
             )
         )

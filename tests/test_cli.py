@@ -219,8 +219,8 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert sum(task["paper_name"] is not None for task in tasks.values()) == 16
     battle = tasks["micro/MMM2"]
     sizes = ("agents", "enemies", "actions", "obs", "state", "limit", "alpha", "beta")
-    assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, None, None]
-    assert set(listing["algorithms"]) == {"race", "matd3", "maddpg"}
+    assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, 0.01, 1e-2]
+    assert set(listing["algorithms"]) == {"race", "matd3", "maddpg", "facmac"}
     race("list")
     table = capsys.readouterr().out
     assert "mamujoco/HumanoidStandup-9x8" in table
@@ -285,7 +285,13 @@ def test_render_a_battle(
         ("render micro/2s3z --policy best", "scripted"),
         ("render micro/2s3z --seconds nan", "0 or more"),
         ("render micro/2s3z --seed 4294967296", "below"),
-        ("train micro/2s3z", "race render micro/2s3z"),
+        ("train micro/2s3z --algo matd3", "--algo facmac"),
+        ("train micro/2s3z --base maddpg", "--base facmac"),
+        ("train micro/2s3z --facmac.batch-size 64 --facmac.replay-capacity 32", "minibatch"),
+        ("train micro/2s3z --facmac.actor-learning-rate inf", "finite"),
+        ("train micro/2s3z --facmac.epsilon-start 1.5", "[0, 1]"),
+        ("train micro/2s3z --facmac.td-lambda nan", "td-lambda"),
+        ("train probe/chain --facmac.mixer-size 0", "at least 1"),
         ("train micro/2s3y", "2s3z"),
         ("plot", "which runs"),
         ("plot nowhere", "not a directory"),

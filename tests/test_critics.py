@@ -1,5 +1,6 @@
 """Critics against explicit loops in float64."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -31,11 +32,19 @@ def float64(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)
 
 
-def mlp(x: np.ndarray, layers: list[tuple[np.ndarray, np.ndarray]]) -> float:
+def relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0.0)
+
+
+def mlp(
+    x: np.ndarray,
+    layers: list[tuple[np.ndarray, np.ndarray]],
+    activation: Callable[[np.ndarray], np.ndarray] = leaky,
+) -> float:
     for place, (weight, bias) in enumerate(layers):
         x = x @ weight + bias
         if place < len(layers) - 1:
-            x = leaky(x)
+            x = activation(x)
     (value,) = x
     return float(value)
 
@@ -105,9 +114,22 @@ def test_first_layers_range_counts_the_embedding(tiny_spec: EnvSpec) -> None:
         assert 0.97 * bound < np.abs(weight).max() <= bound
 
 
-def test_state_values(tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array]) -> None:
-    network = init_state_value(jax.random.key(5), tiny_spec, (5, H))
-    v = state_values(network, inputs[0])
+@pytest.mark.parametrize("sizes", [(5, H), (6,)])
+@pytest.mark.parametrize("activation", [leaky, relu], ids=["leaky", "relu"])
+def test_state_values(
+    inputs: tuple[jax.Array, jax.Array],
+    sizes: tuple[int, ...],
+    activation: Callable[[np.ndarray], np.ndarray],
+) -> None:
+    network = init_state_value(jax.random.key(5), 4, sizes)
+    assert len(network.layers) == len(sizes) + 1
     layers = [(x.weight, x.bias) for x in float64(network).layers]
-    for b in range(B):
-        np.testing.assert_allclose(v[b], mlp(float64(inputs[0][b]), layers), rtol=1e-5, atol=1e-6)
+    expected = [mlp(float64(inputs[0][b]), layers, activation) for b in range(B)]
+    other = [mlp(float64(inputs[0][b]), layers, relu) for b in range(B)]
+    if activation is leaky:
+        # Leaky is what state values are without a word.
+        v = state_values(network, inputs[0])
+        assert not np.allclose(expected, other, rtol=1e-4)
+    else:
+        v = state_values(network, inputs[0], jax.nn.relu)
+    np.testing.assert_allclose(v, expected, rtol=1e-5, atol=1e-6)

@@ -14,6 +14,11 @@ from race import equations as eq
 LN2 = np.log(2.0)
 
 
+def bound_of(scores: Any) -> Any:
+    """Eq. (3) of a batch's scores."""
+    return eq.mutual_information_bound(eq.mutual_information_signal(scores))
+
+
 def ln(*rows: list[float]) -> list[list[float]]:
     return np.log(np.array(rows)).tolist()
 
@@ -55,8 +60,9 @@ CASES: dict[str, tuple[Callable[..., Any], list[Any], Any]] = {
         [[[-1e4, 1e4], [1e4, -1e4]]],
         [-2e4, -2e4],
     ),
-    "bound": (
-        eq.mutual_information_bound,
+    "bound": (eq.mutual_information_bound, [[-2.5, -5.5, -2.0]], -10 / 3),
+    "bound of three samples": (
+        bound_of,
         [ln([1, 3, 1], [7, 1 / 3, 15], [1, 1, 1])],
         -(2.5 + 5.5 + 2) / 3 * LN2,
     ),
@@ -117,9 +123,9 @@ def test_terminated_cuts_the_future_and_truncated_does_not() -> None:
 
 
 def test_bound_prefers_matched_pairs() -> None:
-    matched = eq.mutual_information_bound(10.0 * jnp.eye(4))
-    mismatched = eq.mutual_information_bound(10.0 * (1.0 - jnp.eye(4)))
-    blind = eq.mutual_information_bound(jnp.zeros((4, 4)))
+    matched = bound_of(10.0 * jnp.eye(4))
+    mismatched = bound_of(10.0 * (1.0 - jnp.eye(4)))
+    blind = bound_of(jnp.zeros((4, 4)))
     assert mismatched < blind < matched
     np.testing.assert_allclose(blind, -2 * LN2, rtol=1e-6)
 
@@ -127,7 +133,7 @@ def test_bound_prefers_matched_pairs() -> None:
 @pytest.mark.parametrize("size", [1e-3, 1.0, 1e4])
 def test_gradients_of_the_signal_stay_finite(size: float) -> None:
     scores = size * jax.random.normal(jax.random.key(0), (5, 5))
-    gradient = jax.grad(eq.mutual_information_bound)(scores)
+    gradient = jax.grad(bound_of)(scores)
     assert jnp.isfinite(gradient).all()
 
 
@@ -141,3 +147,91 @@ def test_weights_ignore_the_values_scale_and_offset() -> None:
     np.testing.assert_allclose(
         eq.value_weights(3.0 * value - 5.0), eq.value_weights(value), atol=1e-5
     )
+
+
+# --- masks --------------------------------------------------------------------------------------
+
+REAL = np.array([True, False, True, True, False, False, True])
+
+# Equation -> the shapes of what it is given before its mask; the samples are the last axis.
+MASKED: dict[str, tuple[Callable[..., Any], list[tuple[int, ...]]]] = {
+    "expectation": (eq.expectation, [()]),
+    "expectation of rows": (eq.expectation, [(2, 3)]),
+    "td_loss of one critic": (eq.td_loss, [(1,), ()]),
+    "td_loss of twins": (eq.td_loss, [(2,), ()]),
+    "vfm": (eq.value_function_maximization_loss, [(), ()]),
+    "bound": (eq.mutual_information_bound, [()]),
+    "state_value_loss": (eq.state_value_loss, [(), ()]),
+    "vmm": (eq.value_aware_mi_loss, [(), ()]),
+    "marl_policy_loss": (eq.marl_policy_loss, [()]),
+}
+
+
+def samples(shapes: list[tuple[int, ...]]) -> list[np.ndarray]:
+    rng = np.random.default_rng(3)
+    return [rng.normal(size=(*shape, REAL.size)).astype(np.float32) for shape in shapes]
+
+
+@pytest.mark.parametrize("padding", [0.0, -1e6, 1e6, np.nan, np.inf])
+@pytest.mark.parametrize("case", MASKED)
+def test_a_masked_batch_is_the_batch_without_its_padding(case: str, padding: float) -> None:
+    function, shapes = MASKED[case]
+    given = samples(shapes)
+    alone = function(*(jnp.asarray(x[..., REAL]) for x in given))
+    padded = [jnp.asarray(np.where(REAL, x, np.float32(padding))) for x in given]
+    masked = jax.jit(function)(*padded, jnp.asarray(REAL, jnp.float32))
+    assert masked.dtype == jnp.float32
+    np.testing.assert_allclose(masked, alone, rtol=1e-5)
+    # Without the mask the padding would count.
+    assert not np.allclose(function(*padded), alone, rtol=1e-3)
+
+
+@pytest.mark.parametrize("case", [case for case in MASKED if "rows" not in case])
+def test_padding_gets_no_gradient(case: str) -> None:
+    function, shapes = MASKED[case]
+    given = samples(shapes)
+    places = tuple(range(len(given)))
+    alone = jax.grad(function, argnums=places)(*(jnp.asarray(x[..., REAL]) for x in given))
+    mask = jnp.asarray(REAL, jnp.float32)
+    masked = jax.grad(function, argnums=places)(*map(jnp.asarray, given), mask)
+    for a, m in zip(alone, masked, strict=True):
+        np.testing.assert_allclose(np.asarray(m)[..., REAL], a, rtol=1e-5)
+        assert (np.asarray(m)[..., ~REAL] == 0).all()
+
+
+@pytest.mark.parametrize("case", MASKED)
+def test_a_mask_of_ones_is_no_mask(case: str) -> None:
+    function, shapes = MASKED[case]
+    given = [jnp.asarray(x) for x in samples(shapes)]
+    np.testing.assert_allclose(
+        function(*given, jnp.ones(REAL.size)), function(*given), rtol=1e-5, atol=1e-7
+    )
+
+
+@pytest.mark.parametrize("padding", [-1e6, 0.0, 1e6, np.nan])
+def test_weights_normalise_over_the_real_samples(padding: float) -> None:
+    (value,) = samples([()])
+    padded = jnp.asarray(np.where(REAL, value, np.float32(padding)))
+    weights = eq.value_weights(padded, jnp.asarray(REAL, jnp.float32))
+    alone = eq.value_weights(jnp.asarray(value[REAL]))
+    np.testing.assert_allclose(np.asarray(weights)[REAL], alone, rtol=1e-6)
+    assert sorted(np.asarray(weights)[REAL].tolist())[:: REAL.sum() - 1] == [0.0, 1.0]
+
+
+@pytest.mark.parametrize("padding", [-1e4, 0.0, 1e4])
+def test_negatives_are_the_real_samples(padding: float) -> None:
+    scores = 3.0 * np.random.default_rng(4).normal(size=(REAL.size, REAL.size))
+    both = REAL[:, None] & REAL
+    padded = jnp.asarray(np.where(both, scores, padding), jnp.float32)
+    signal = eq.mutual_information_signal(padded, jnp.asarray(REAL, jnp.float32))
+    n = int(REAL.sum())
+    alone = eq.mutual_information_signal(jnp.asarray(scores[both].reshape(n, n), jnp.float32))
+    np.testing.assert_allclose(np.asarray(signal)[REAL], alone, rtol=1e-5)
+    every = eq.mutual_information_signal(padded)
+    assert not np.allclose(np.asarray(every)[REAL], alone, rtol=1e-3)
+
+
+def test_a_lone_sample_has_no_negatives() -> None:
+    scores = jnp.array([[np.log(3.0), 5.0], [5.0, 5.0]], jnp.float32)
+    signal = eq.mutual_information_signal(scores, jnp.array([1.0, 0.0]))
+    np.testing.assert_allclose(signal[0], -np.log(4 / 3), rtol=1e-6)

@@ -7,7 +7,19 @@ import pytest
 
 PACKAGE = Path(__file__).parent.parent / "race"
 GROUND = {"types", "config", "errors", "checks", "presets"}
-MATHEMATICS = {"equations", "genetics", "networks", "critics", "optimization", "replay"}
+MATHEMATICS = {
+    "equations",
+    "genetics",
+    "networks",
+    "critics",
+    "optimization",
+    "replay",
+    "returns",
+    "exploration",
+    "gru",
+    "recurrent",
+    "factored",
+}
 # Top-level name under `race` -> the names it may import from `race`, besides its own.
 ALLOWED = {
     **dict.fromkeys(GROUND, GROUND),

@@ -14,18 +14,19 @@ import pytest
 from race import programs
 from race.algorithms import algorithm_of
 from race.config import Config, EnvConfig, LearnerConfig, RaceConfig
-from race.critics import pevfa_values, q_values, state_values
 from race.envs import make_task
 from race.envs.probe import LAST, ChainEnv, TargetEnv
-from race.generation import store
+from race.learners import learner_of
 from race.presets import resolve
 from race.replay import init_replay
 from race.rollouts.host import EnvPool, collect
+from race.rollouts.transitions import empty_transition, store
 from race.run_state import statics
 from race.types import Task, Transition
 
 DISCOUNT = 0.8
-METHODS = [("race", "matd3"), ("race", "maddpg"), ("matd3", "matd3"), ("maddpg", "maddpg")]
+BASES = ("matd3", "maddpg", "facmac")
+METHODS = [(algo, base) for base in BASES for algo in ("race", base)]
 
 
 class Learned:
@@ -50,10 +51,10 @@ class Learned:
             )
         )
         self.config, self.spec = config, task.spec
-        self.algorithm = algorithm_of(config)
+        self.algorithm, self.learner = algorithm_of(config), learner_of(config)
         fixed = statics(config, task.spec, self.algorithm)
         state = programs.start(jax.random.key(0), **fixed)
-        replay = store(init_replay(task.spec, max(len(data.reward), 2048)), data)
+        replay = store(init_replay(empty_transition(task.spec), max(len(data.reward), 2048)), data)
         sums = programs.empty_losses(self.algorithm)
         zero, count = np.int32(0), np.int32(steps)
         self.state, _ = programs.learn(
@@ -64,7 +65,7 @@ class Learned:
         """The MARL team's joint actions."""
         from race.networks import act, encode
 
-        encoder, heads = self.algorithm.teams(self.state)
+        encoder, heads = self.algorithm.teams(self.state, self.spec)
         return np.asarray(
             act(encode(encoder, self.spec, jnp.asarray(states)), heads[-1], self.spec)
         )
@@ -72,17 +73,19 @@ class Learned:
     def q(self, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The MARL critic, first of the ensemble."""
         critic = self.state.critics.critic if self.config.has_population else self.state.critic
-        return np.asarray(q_values(critic.params, jnp.asarray(states), jnp.asarray(actions))[0])
+        s, u = jnp.asarray(states), jnp.asarray(actions)
+        return np.asarray(self.learner.q_marl(critic.params, s, u, self.spec)[0])
 
     def q_team(self, team: int, states: np.ndarray, actions: np.ndarray) -> np.ndarray:
         """The PeVFA for a team of the population."""
         pevfa, head = self.state.critics.pevfa.params, self.state.heads[team]
         s, u = jnp.asarray(states), jnp.asarray(actions)
-        return np.asarray(pevfa_values(pevfa, self.spec, s, u, head)[0])
+        return np.asarray(self.learner.q_team(pevfa, s, u, head, self.spec)[0])
 
     def v(self, states: np.ndarray) -> np.ndarray:
         """The state-value net."""
-        return np.asarray(state_values(self.state.critics.value.params, jnp.asarray(states)))
+        value = self.state.critics.value.params
+        return np.asarray(self.learner.state_values(value, jnp.asarray(states)))
 
 
 def random_data(task: Task, steps: int) -> Transition:
@@ -158,7 +161,7 @@ def test_value_flows_back_discounted(train: Train, algo: str, base: str) -> None
 def _team_action(learned: Learned, head: Any, states: np.ndarray) -> np.ndarray:
     from race.networks import act, encode
 
-    encoder = learned.algorithm.teams(learned.state).encoder
+    encoder = learned.algorithm.teams(learned.state, learned.spec).encoder
     return np.asarray(act(encode(encoder, learned.spec, jnp.asarray(states)), head, learned.spec))
 
 

@@ -9,14 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from race.replay import Replay, init_replay, insert, sample
-from race.types import EnvSpec, Transition
+from race.replay import Replay, distinct_places, episodes_at, init_replay, insert, sample
+from race.rollouts.episodes import empty_episode
+from race.rollouts.transitions import empty_transition
+from race.types import DiscreteSpec, EnvSpec, Episode, Transition
 
 CAPACITY, ROWS = 7, 5
 SPEC = EnvSpec("t", 2, ((0,), (1,)), ((0,), (1,)), (-1.0, -1.0), (1.0, 1.0), 5)
+DISCRETE = DiscreteSpec("d", n_agents=2, obs_size=3, state_size=4, n_actions=5, episode_limit=6)
+ITEM = empty_transition(SPEC)
 
 _insert = jax.jit(insert)
 _sample = jax.jit(sample, static_argnames="batch_size")
+_distinct_places = jax.jit(distinct_places, static_argnames="batch_size")
+_episodes_at = jax.jit(episodes_at, static_argnames="steps")
 
 
 def rows_from(first: int, length: int = ROWS) -> Transition:
@@ -27,7 +33,7 @@ def rows_from(first: int, length: int = ROWS) -> Transition:
 
 
 def filled(inserted: int) -> Replay:
-    replay, first = init_replay(SPEC, CAPACITY), 0
+    replay, first = init_replay(ITEM, CAPACITY), 0
     while first < inserted:
         count = min(ROWS, inserted - first)
         replay = _insert(replay, rows_from(first), jnp.int32(count))
@@ -38,7 +44,7 @@ def filled(inserted: int) -> Replay:
 @settings(deadline=None, max_examples=60)
 @given(st.lists(st.integers(0, ROWS), max_size=8))
 def test_holds_what_a_deque_holds(counts: list[int]) -> None:
-    replay, model, first = init_replay(SPEC, CAPACITY), deque[int](maxlen=CAPACITY), 1
+    replay, model, first = init_replay(ITEM, CAPACITY), deque[int](maxlen=CAPACITY), 1
     for count in counts:
         # Rows behind `count` must not be stored: they are poisoned.
         rows = rows_from(first)
@@ -71,7 +77,7 @@ def test_rows_as_long_as_the_capacity() -> None:
 
 
 def test_starts_empty_in_float32() -> None:
-    replay = init_replay(SPEC, CAPACITY)
+    replay = init_replay(ITEM, CAPACITY)
     assert replay.capacity == CAPACITY
     assert int(replay.inserted) == 0
     assert {column.dtype for column in replay.data} == {jnp.dtype(jnp.float32)}
@@ -100,3 +106,92 @@ def test_samples_differ_between_keys() -> None:
     replay = filled(7)
     one, two = (_sample(replay, batch_size=20, key=jax.random.key(k)) for k in (0, 1))
     assert not jnp.array_equal(one.reward, two.reward)
+
+
+# --- whole episodes -----------------------------------------------------------------------------
+
+
+def episodes_from(first: int, length: int = ROWS) -> Episode:
+    """Episodes first, first + 1, ..., every entry of which tells number, column and moment."""
+    numbers = np.arange(first, first + length)
+    steps = DISCRETE.episode_limit
+    empty = empty_episode(DISCRETE, "float32", length)
+    ones = [np.ones_like(column) for column in empty]
+
+    def fill(column: np.ndarray, scale: float) -> np.ndarray:
+        """[n, moments, ...] of ``scale * (100 n + moment)``."""
+        moments = 100 * numbers[:, None] + np.arange(column.shape[1])
+        told = scale * moments.reshape(*moments.shape, *[1] * (column.ndim - 2))
+        return (told * column).astype(column.dtype)
+
+    obs, state, available, action, reward, terminated, _ = ones
+    return Episode(
+        obs=fill(obs, 1.0),
+        state=fill(state, -1.0),
+        avail_actions=np.broadcast_to(
+            (numbers % 2 == 0)[:, None, None, None], available.shape
+        ).copy(),
+        action=(fill(action.astype(np.int64), 1.0) % 5).astype(action.dtype),
+        reward=fill(reward, 2.0),
+        terminated=fill(terminated, 3.0),
+        length=(numbers % steps + 1).astype(np.int32),
+    )
+
+
+def filled_with_episodes(inserted: int) -> Replay:
+    replay, first = init_replay(empty_episode(DISCRETE, "float32"), CAPACITY), 0
+    while first < inserted:
+        count = min(ROWS, inserted - first)
+        replay = _insert(replay, episodes_from(first), jnp.int32(count))
+        first += count
+    return replay
+
+
+@pytest.mark.parametrize("precision", ["float16", "float32"])
+def test_columns_have_the_shapes_and_types_of_the_item(precision: str) -> None:
+    item = empty_episode(DISCRETE, precision)
+    replay = init_replay(item, CAPACITY)
+    assert replay.capacity == CAPACITY
+    assert replay.data.obs.dtype == precision
+    for column, one in zip(replay.data, item, strict=True):
+        assert column.shape == (CAPACITY, *one.shape)
+        assert column.dtype == one.dtype
+        assert not np.asarray(column).any()
+
+
+@pytest.mark.parametrize("steps", [1, 4, 6])
+def test_episodes_are_cut_and_stay_whole(steps: int) -> None:
+    replay = filled_with_episodes(12)
+    places = jnp.array([3, 0, 6, 3], jnp.int32)
+    numbers = [10, 7, 6, 10]  # place 3 holds 10 since the eleventh episode, and so on
+    batch = _episodes_at(replay, places, steps=steps)
+    for row, number in enumerate(numbers):
+        whole = episodes_from(number, 1)
+        for name in ("obs", "state", "avail_actions"):
+            expected = getattr(whole, name)[0, : steps + 1]
+            np.testing.assert_array_equal(getattr(batch, name)[row], expected)
+        for name in ("action", "reward", "terminated"):
+            np.testing.assert_array_equal(
+                getattr(batch, name)[row], getattr(whole, name)[0, :steps]
+            )
+        assert int(batch.length[row]) == int(whole.length[0])
+    assert [column.dtype for column in batch] == [column.dtype for column in replay.data]
+
+
+@pytest.mark.parametrize(("inserted", "present"), [(2, 2), (5, 5), (7, 7), (16, 7)])
+def test_distinct_places_are_uniform_subsets_of_what_is_stored(inserted: int, present: int) -> None:
+    replay, size, draws = filled_with_episodes(inserted), 2, 2000
+    keys = jax.random.split(jax.random.key(5), draws)
+    places = np.asarray(jax.vmap(lambda key: _distinct_places(replay, size, key))(keys))
+    assert places.dtype == np.int32
+    assert (places[:, 0] != places[:, 1]).all()
+    assert set(places.ravel().tolist()) == set(range(present))
+    for column in places.T:
+        counts = np.bincount(column, minlength=present)
+        p = 1 / present
+        assert (np.abs(counts - draws * p) <= 5 * np.sqrt(draws * p * (1 - p))).all()
+
+
+def test_all_that_is_stored_can_be_drawn_at_once() -> None:
+    places = _distinct_places(filled_with_episodes(5), 5, jax.random.key(0))
+    assert sorted(places.tolist()) == list(range(5))

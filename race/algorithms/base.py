@@ -3,8 +3,11 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
+
+from race.types import Spec
 
 Losses = dict[str, Float[Array, ""]]
 
@@ -21,8 +24,8 @@ class Algorithm(NamedTuple):
 
     init: Callable[..., Any]
     """(key, spec, config) -> state."""
-    teams: Callable[[Any], Teams]
-    """state -> the teams that act."""
+    teams: Callable[..., Teams]
+    """(state, spec) -> the teams that act."""
     champion: Callable[[Any], Float[Array, "N H1 A"]]
     """state -> heads of the team of best training fitness."""
     evolve: Callable[..., Any]
@@ -39,11 +42,18 @@ class Algorithm(NamedTuple):
 
 
 def tested_teams(
-    algorithm: Algorithm, state: Any, has_population: bool
+    algorithm: Algorithm, state: Any, spec: Spec, has_population: bool
 ) -> tuple[Any, dict[str, Float[Array, "N H1 A"]]]:
     """Encoders, and heads of the teams that are tested: ``marl`` and, if any, ``champion``."""
-    encoder, heads = algorithm.teams(state)
+    encoder, heads = algorithm.teams(state, spec)
     tested = {"marl": heads[-1]}
     if has_population:
         tested["champion"] = algorithm.champion(state)
     return encoder, tested
+
+
+def when(due: bool | Bool[Array, ""], step: Any, idle: Any, state: Any) -> Any:
+    """``step(state)`` if it is due, else ``idle(state)``; no branch is compiled that never runs."""
+    if isinstance(due, bool):
+        return step(state) if due else idle(state)
+    return jax.lax.cond(due, step, idle, state)

@@ -1,4 +1,4 @@
-"""The gradient learner alone: MATD3 and MADDPG, the paper's baselines."""
+"""The gradient learner alone: MATD3, MADDPG and FACMAC, the paper's baselines."""
 
 from typing import Any, NamedTuple
 
@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from race.algorithms.base import Algorithm, Losses, Teams
+from race.algorithms.base import Algorithm, Losses, Teams, when
 from race.config import Config
-from race.equations import marl_policy_loss, td_loss, td_target
-from race.learners import LEARNERS
-from race.optimization import Trainable, copy, descend, init_trainable, track
-from race.types import EnvSpec, Transition
+from race.equations import marl_policy_loss, td_loss
+from race.learners import learner_of
+from race.optimization import Trainable, copy, descend, init_trainable
+from race.types import Spec
 
 
 class Targets(NamedTuple):
@@ -31,13 +31,13 @@ class MarlState(NamedTuple):
     target: Targets
 
 
-def init(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> MarlState:
+def init(key: PRNGKeyArray, spec: Spec, config: Config) -> MarlState:
     """A fresh learner whose targets equal its networks."""
-    learner = LEARNERS[config.base]
+    learner = learner_of(config)
     encoder_key, head_key, critic_key = jax.random.split(key, 3)
-    encoder = learner.init_encoder(encoder_key, spec, config.learner)
-    head = learner.init_head(head_key, spec, config.learner)
-    critic = learner.init_critic(critic_key, spec, config.learner)
+    encoder = learner.init_encoder(encoder_key, spec, config)
+    head = learner.init_head(head_key, spec, config)
+    critic = learner.init_critic(critic_key, spec, config)
     return MarlState(
         init_trainable(encoder),
         init_trainable(head),
@@ -48,23 +48,26 @@ def init(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> MarlState:
 
 def update(
     state: MarlState,
-    batch: Transition,
+    batch: Any,
     step: Int[Array, ""],
     key: PRNGKeyArray,
-    spec: EnvSpec,
+    spec: Spec,
     config: Config,
 ) -> tuple[MarlState, Losses, Losses]:
     """One gradient step: the critic always, the policy when its delay is over."""
-    learner, hyper = LEARNERS[config.base], config.learner
+    learner, hyper = learner_of(config), config.hyper
     target = state.target
+    target_key, policy_key = jax.random.split(key)
+    now, taken, mask = learner.now(batch, spec)
+    later = learner.later(batch, spec)
 
-    z_next = learner.encode(target.encoder, spec, batch.next_state)
-    next_action = learner.smooth(learner.act(z_next, target.head, spec), key, hyper)
-    next_value = learner.pessimistic(learner.q_marl(target.critic, batch.next_state, next_action))
-    y = td_target(batch.reward, batch.terminated, next_value, hyper.discount)
+    z_next = learner.encode(target.encoder, later, spec)
+    next_action = learner.target_action(z_next, target.head, later, target_key, spec, config)
+    next_value = learner.pessimistic(learner.q_marl(target.critic, later, next_action, spec))
+    y = learner.td_target(batch, next_value, config)
 
     def critic_loss(critic: Any) -> Float[Array, ""]:
-        return td_loss(learner.q_marl(critic, batch.state, batch.action), y)
+        return td_loss(learner.q_marl(critic, now, taken, spec), y, mask)
 
     loss, gradient = jax.value_and_grad(critic_loss)(state.critic.params)
     critic = descend(state.critic, gradient, hyper.critic_learning_rate, hyper.gradient_clip)
@@ -74,8 +77,9 @@ def update(
         maximised = learner.first_critic(state.critic.params)
 
         def policy_loss(encoder: Any, head: Any) -> Float[Array, ""]:
-            action = learner.act(learner.encode(encoder, spec, batch.state), head, spec)
-            return marl_policy_loss(learner.q_marl(maximised, batch.state, action)[0])
+            z = learner.encode(encoder, now, spec)
+            action = learner.act(z, head, now, policy_key, spec)
+            return marl_policy_loss(learner.q_marl(maximised, now, action, spec)[0], mask)
 
         loss, (encoder_gradient, head_gradient) = jax.value_and_grad(policy_loss, argnums=(0, 1))(
             state.encoder.params, state.head.params
@@ -84,29 +88,29 @@ def update(
         encoder = descend(state.encoder, encoder_gradient, rate, clip)
         head = descend(state.head, head_gradient, rate, clip)
         online = Targets(encoder.params, head.params, state.critic.params)
-        moved = track(state.target, online, hyper.target_update_rate)
+        moved = learner.follow(state.target, online, step, config)
         return MarlState(encoder, head, state.critic, moved), {"policy": loss}
 
     def idle(state: MarlState) -> tuple[MarlState, Losses]:
         return state, {"policy": jnp.zeros(())}
 
-    state, policy_losses = jax.lax.cond(
-        (step + 1) % hyper.policy_delay == 0, policy_step, idle, state
-    )
+    state, policy_losses = when(learner.policy_due(step, config), policy_step, idle, state)
     return state, {"critic": loss}, policy_losses
 
 
-def teams(state: MarlState) -> Teams:
+def teams(state: MarlState, spec: Spec) -> Teams:
     """The one team there is."""
-    return Teams(state.encoder.params, state.head.params[None])
+    head = state.head.params
+    every = jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
+    return Teams(state.encoder.params, every[None])
 
 
-def _champion(state: MarlState) -> Float[Array, "N H1 A"]:
+def _champion(state: MarlState) -> Float[Array, "_ H1 A"]:
     return state.head.params
 
 
 def _evolve(
-    state: MarlState, fitness: Float[Array, "P"], key: PRNGKeyArray, spec: EnvSpec, config: Config
+    state: MarlState, fitness: Float[Array, "P"], key: PRNGKeyArray, spec: Spec, config: Config
 ) -> MarlState:
     return state
 

@@ -15,34 +15,31 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from race.algorithms.base import Algorithm, Losses, Teams
+from race.algorithms.base import Algorithm, Losses, Teams, when
 from race.config import Config
-from race.critics import init_state_value, state_values
 from race.equations import (
     best_target,
     encoder_loss,
     marl_policy_loss,
     mutual_information_bound,
-    mutual_information_signal,
     state_value_loss,
     td_loss,
-    td_target,
     value_aware_mi_loss,
     value_function_maximization_loss,
     value_weights,
 )
 from race.genetics import breed, inject, mutate_population, select
-from race.learners import LEARNERS
-from race.networks import init_mine, mine_scores
-from race.optimization import copy, descend, init_trainable, track
-from race.types import EnvSpec, Transition
+from race.learners import learner_of
+from race.learners.base import Samples
+from race.optimization import copy, descend, init_trainable
+from race.types import Spec
 
 
 class Targets(NamedTuple):
     """Target networks, marked by a prime in the paper. Population teams have none."""
 
     encoder: Any
-    head: Float[Array, "N H1 A"]
+    head: Float[Array, "_ H1 A"]
     critic: Any
     pevfa: Any
 
@@ -76,19 +73,19 @@ class RaceState(NamedTuple):
     injection_counts: Int[Array, "3"]  # elite, parent, discarded
 
 
-def init(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> RaceState:
+def init(key: PRNGKeyArray, spec: Spec, config: Config) -> RaceState:
     """Line 1."""
-    learner, hyper, race = LEARNERS[config.base], config.learner, config.race
+    learner = learner_of(config)
     keys = jax.random.split(key, 7)
-    encoder = learner.init_encoder(keys[0], spec, hyper)
-    head = learner.init_head(keys[1], spec, hyper)
-    critic = learner.init_critic(keys[2], spec, hyper)
-    pevfa = learner.init_pevfa(keys[3], spec, hyper, race.policy_embedding_size)
-    value = init_state_value(keys[4], spec, hyper.hidden_sizes)
-    mine = init_mine(keys[5], spec, hyper.hidden_sizes[1], race.mine_size)
+    encoder = learner.init_encoder(keys[0], spec, config)
+    head = learner.init_head(keys[1], spec, config)
+    critic = learner.init_critic(keys[2], spec, config)
+    pevfa = learner.init_pevfa(keys[3], spec, config)
+    value = learner.init_value(keys[4], spec, config)
+    mine = learner.init_mine(keys[5], spec, config)
     heads = [
-        learner.init_head(team_key, spec, hyper)
-        for team_key in jax.random.split(keys[6], race.population_size)
+        learner.init_heads(team_key, spec, config)
+        for team_key in jax.random.split(keys[6], config.race.population_size)
     ]
     return RaceState(
         policies=Policies(*map(init_trainable, (encoder, head, mine))),
@@ -102,17 +99,22 @@ def init(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> RaceState:
     )
 
 
-def teams(state: RaceState) -> Teams:
+def teams(state: RaceState, spec: Spec) -> Teams:
     """The population and, last, the MARL team, all over the same encoders."""
-    heads = jnp.concatenate([state.heads, state.policies.head.params[None]])
+    heads = jnp.concatenate([state.heads, _marl_team(state)[None]])
     return Teams(state.policies.encoder.params, heads)
+
+
+def _marl_team(state: RaceState) -> Float[Array, "N H1 A"]:
+    """The MARL team with a head for every agent, also where its agents share one."""
+    return jnp.broadcast_to(state.policies.head.params, state.heads.shape[1:])
 
 
 def evolve(
     state: RaceState,
     fitness: Float[Array, "P"],
     key: PRNGKeyArray,
-    spec: EnvSpec,
+    spec: Spec,
     config: Config,
 ) -> RaceState:
     """Line 9: selection, agent-level crossover and mutation; and what became of the injected."""
@@ -144,62 +146,64 @@ def evolve(
 
 def update(
     state: RaceState,
-    batch: Transition,
+    batch: Any,
     step: Int[Array, ""],
     key: PRNGKeyArray,
-    spec: EnvSpec,
+    spec: Spec,
     config: Config,
 ) -> tuple[RaceState, Losses, Losses]:
     """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
-    team_key, marl_key, smooth_key = jax.random.split(key, 3)
+    learner = learner_of(config)
+    team_key, critic_key, policy_key = jax.random.split(key, 3)
     team = state.heads[jax.random.randint(team_key, (), 0, config.race.population_size)]
+    samples = learner.now(batch, spec)
     state, critic_losses, value = _train_critics(
-        state, batch, team, (marl_key, smooth_key), spec, config
+        state, batch, samples, team, critic_key, spec, config
     )
 
     def policy_step(state: RaceState) -> tuple[RaceState, Losses]:
-        return _train_policies(state, batch, team, value, spec, config)
+        return _train_policies(state, samples, team, value, step, policy_key, spec, config)
 
     def idle(state: RaceState) -> tuple[RaceState, Losses]:
         return state, {name: jnp.zeros(()) for name in POLICY_LOSSES}
 
-    delay_over = (step + 1) % config.learner.policy_delay == 0
-    state, policy_losses = jax.lax.cond(delay_over, policy_step, idle, state)
+    state, policy_losses = when(learner.policy_due(step, config), policy_step, idle, state)
     return state, critic_losses, policy_losses
 
 
 def _train_critics(
     state: RaceState,
-    batch: Transition,
+    batch: Any,
+    samples: Samples,
     team: Float[Array, "N H1 A"],
-    keys: tuple[PRNGKeyArray, PRNGKeyArray],
-    spec: EnvSpec,
+    key: PRNGKeyArray,
+    spec: Spec,
     config: Config,
 ) -> tuple[RaceState, Losses, Float[Array, "B"]]:
     """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch."""
-    learner, hyper, target = LEARNERS[config.base], config.learner, state.target
+    learner, hyper, target = learner_of(config), config.hyper, state.target
+    now, taken, mask = samples
+    later = learner.later(batch, spec)
+    marl_key, team_key = jax.random.split(key)
 
     # One pass of the target encoders serves both teams. Eq. (1) gives a prime to the MARL team's
     # policies alone; W_j has no slowly moving copy, but the encoder below it has.
-    z_next = learner.encode(target.encoder, spec, batch.next_state)
-    marl_action = learner.smooth(learner.act(z_next, target.head, spec), keys[0], hyper)
-    team_action = learner.smooth(learner.act(z_next, team, spec), keys[1], hyper)
-    marl_next = learner.q_marl(target.critic, batch.next_state, marl_action)
-    team_next = learner.q_team(target.pevfa, spec, batch.next_state, team_action, team)
+    z = learner.encode(target.encoder, later, spec)
+    marl_action = learner.target_action(z, target.head, later, marl_key, spec, config)
+    team_action = learner.target_action(z, team, later, team_key, spec, config)
+    marl_next = learner.q_marl(target.critic, later, marl_action, spec)
+    team_next = learner.q_team(target.pevfa, later, team_action, team, spec)
     y_marl, y_team = (
-        td_target(batch.reward, batch.terminated, learner.pessimistic(q), hyper.discount)
-        for q in (marl_next, team_next)
+        learner.td_target(batch, learner.pessimistic(q), config) for q in (marl_next, team_next)
     )
     best = best_target(y_marl, y_team)
 
     def loss(critics: Critics) -> tuple[Float[Array, ""], tuple[Losses, Float[Array, "B"]]]:
-        value = state_values(critics.value, batch.state)
+        value = learner.state_values(critics.value, now)
         losses = {
-            "critic": td_loss(learner.q_marl(critics.critic, batch.state, batch.action), y_marl),
-            "pevfa": td_loss(
-                learner.q_team(critics.pevfa, spec, batch.state, batch.action, team), y_team
-            ),
-            "value": state_value_loss(value, best),
+            "critic": td_loss(learner.q_marl(critics.critic, now, taken, spec), y_marl, mask),
+            "pevfa": td_loss(learner.q_team(critics.pevfa, now, taken, team, spec), y_team, mask),
+            "value": state_value_loss(value, best, mask),
         }
         # The three share no parameter: the gradient of the sum is each one's own.
         return losses["critic"] + losses["pevfa"] + losses["value"], (losses, value)
@@ -217,39 +221,43 @@ def _train_critics(
 
 def _train_policies(
     state: RaceState,
-    batch: Transition,
+    samples: Samples,
     team: Float[Array, "N H1 A"],
     value: Float[Array, "B"],
-    spec: EnvSpec,
+    step: Int[Array, ""],
+    key: PRNGKeyArray,
+    spec: Spec,
     config: Config,
 ) -> tuple[RaceState, Losses]:
     """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE."""
-    learner, hyper, race = LEARNERS[config.base], config.learner, config.race
-    assert race.vmm_weight is not None
-    beta = race.vmm_weight
+    learner, hyper, beta = learner_of(config), config.hyper, config.race.vmm_weight
+    assert beta is not None
+    now, _, mask = samples
+    marl_key, team_key, pairs_key = jax.random.split(key, 3)
     critic = learner.first_critic(state.critics.critic.params)
     pevfa = learner.first_pevfa(state.critics.pevfa.params)
-    weights = value_weights(value)
+    weights = value_weights(value, mask)
 
     def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
-        z = learner.encode(policies.encoder, spec, batch.state)
-        marl_action = learner.act(z, policies.head, spec)
-        team_action = learner.act(z, team, spec)
-        q_marl = learner.q_marl(critic, batch.state, marl_action)[0]
-        q_team = learner.q_team(pevfa, spec, batch.state, team_action, team)[0]
+        z = learner.encode(policies.encoder, now, spec)
+        marl_action = learner.act(z, policies.head, now, marl_key, spec)
+        team_action = learner.act(z, team, now, team_key, spec)
+        q_marl = learner.q_marl(critic, now, marl_action, spec)[0]
+        q_team = learner.q_team(pevfa, now, team_action, team, spec)[0]
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
-        # held fixed. Both products are the same numbers and are computed once.
-        fixed_mine = jax.lax.stop_gradient(policies.mine)
-        signal = jax.vmap(mutual_information_signal)(mine_scores(fixed_mine, batch.state, z))
-        fixed_z = jax.lax.stop_gradient(z)
-        bound = jax.vmap(mutual_information_bound)(mine_scores(policies.mine, batch.state, fixed_z))
-        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0))(weights, signal)
-        vfm = value_function_maximization_loss(q_marl, q_team)
-        # Agents share no encoder and no MINE, so sums over agents train each on its own terms.
+        # held fixed. Both are the same numbers and are computed once.
+        fixed_mine, fixed_z = jax.lax.stop_gradient((policies.mine, z))
+        signal = learner.mutual_information(fixed_mine, now, z, pairs_key)
+        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key)
+        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None))(weights, signal, mask)
+        bound = jax.vmap(mutual_information_bound, in_axes=(0, None))(plain, mask)
+        vfm = value_function_maximization_loss(q_marl, q_team, mask)
+        # Encoders and MINEs, of which there are equally many, share no parameter among themselves:
+        # sums train each on its own terms.
         # W_marl enters through q_marl alone: its gradient is that of Eq. (7).
         total = encoder_loss(vfm, jnp.sum(vmm), beta) - jnp.sum(bound)
         losses = {
-            "policy": marl_policy_loss(q_marl),
+            "policy": marl_policy_loss(q_marl, mask),
             "vfm": vfm,
             "vmm": jnp.mean(vmm),
             "mine": -jnp.mean(bound),
@@ -268,13 +276,13 @@ def _train_policies(
         state.critics.critic.params,
         state.critics.pevfa.params,
     )
-    target = track(state.target, online, hyper.target_update_rate)
+    target = learner.follow(state.target, online, step, config)
     return state._replace(policies=policies, target=target), losses
 
 
 def inject_marl(state: RaceState) -> RaceState:
     """Line 11: the MARL team replaces the team of lowest fitness (never the elite)."""
-    heads = inject(state.heads, state.policies.head.params, state.worst)
+    heads = inject(state.heads, _marl_team(state), state.worst)
     return state._replace(heads=heads, injected=state.worst)
 
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from race.bench.measurement import Measurement, Subject
-from race.envs import make_task
+from race.envs import make_continuous_task
 from race.presets import TABLE_3
 
 SECONDS = 1.0
@@ -22,7 +22,7 @@ def subjects() -> list[Subject]:
 
 
 def _measure(name: str, task_id: str) -> list[Measurement]:
-    task = make_task(task_id)
+    task = make_continuous_task(task_id)
     actions = np.random.default_rng(0).uniform(
         task.spec.action_low, task.spec.action_high, (1000, task.spec.joint_action_size)
     )

@@ -14,7 +14,7 @@ from race.bench.measurement import Measurement, Subject
 from race.bench.update import setting
 from race.config import Algo
 from race.generation import CHUNK
-from race.run_state import Progress, n_teams
+from race.run_state import Progress
 from race.trainer import train
 
 GOAL = 0.10
@@ -74,5 +74,5 @@ def _measure(name: str, algo: Algo, steps_per_env_step: float) -> list[Measureme
         try:
             train(path, config, report=stopwatch)
         except _EnoughError:
-            return [Measurement(name, stopwatch.fraction(EPISODE * n_teams(config)), "", GOAL)]
+            return [Measurement(name, stopwatch.fraction(EPISODE * config.n_teams), "", GOAL)]
     raise AssertionError("training ended before the measurement did")

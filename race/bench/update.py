@@ -13,7 +13,7 @@ from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best, seconds
 from race.bench.products import operations, products_alone, products_in
 from race.config import Algo, Config, LearnerConfig
-from race.envs import make_task
+from race.envs import make_continuous_task
 from race.presets import resolve
 from race.replay import Replay, sample
 from race.types import EnvSpec, Transition
@@ -50,7 +50,7 @@ class Updates:
 
     def __init__(self, config: Config, transitions: int = TRANSITIONS) -> None:
         self.config = config
-        self.spec = make_task(config.task, config.env).spec
+        self.spec = make_continuous_task(config.task, config.env).spec
         self.algorithm = algorithm_of(config)
         self.replay = random_replay(self.spec, transitions)
         self._statics = {"algorithm": self.algorithm, "spec": self.spec, "config": config}

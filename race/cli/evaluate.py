@@ -48,8 +48,8 @@ def main(arguments: list[str]) -> None:
 
     from race.cli.compilation import use_cache
     from race.cli.progress import rounded
-    from race.evaluation import Score, evaluate
-    from race.rollouts.host import EnvPool
+    from race.rollouts import rollouts_of
+    from race.rollouts.base import Score
     from race.trained import load_trained
 
     use_cache()
@@ -57,18 +57,22 @@ def main(arguments: list[str]) -> None:
     name = trained.resolve(chosen.team)
     seeds = np.random.SeedSequence(chosen.seed).generate_state(chosen.episodes).astype(np.int64)
     batches = [seeds[i : i + BATCH] for i in range(0, len(seeds), BATCH)]
-    spec, base = trained.task.spec, trained.config.base
     parts: list[Score] = []
     with (
-        EnvPool(trained.task, len(batches[0]), trained.config.env.processes) as pool,
+        rollouts_of(trained.config, trained.task) as rollouts,
         Progress(console=Console(stderr=True), transient=True) as bar,
     ):
         playing = bar.add_task("playing", total=len(seeds))
         for batch in batches:
             heads = {name: trained.heads[name]}
-            parts.append(evaluate(pool, trained.encoder, heads, batch, spec, base)[name])
+            parts.append(rollouts.test(trained.encoder, heads, batch)[name])
             bar.advance(playing, len(batch))
-    score = Score(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    wins = [part.won for part in parts if part.won is not None]
+    score = Score(
+        np.concatenate([part.returns for part in parts]),
+        np.concatenate([part.lengths for part in parts]),
+        np.concatenate(wins) if wins else None,
+    )
     result = {
         "task": trained.config.task,
         "method": trained.config.method,
@@ -77,6 +81,7 @@ def main(arguments: list[str]) -> None:
         "played": name,
         "seed": chosen.seed,
         "episodes": chosen.episodes,
+        **({} if score.win_rate is None else {"win_rate": score.win_rate}),
         "return_mean": score.mean,
         "return_std": score.std,
         "return_min": float(score.returns.min()),
@@ -97,4 +102,5 @@ def main(arguments: list[str]) -> None:
         f"{rounded(score.std)} (from {rounded(score.returns.min())} to "
         f"{rounded(score.returns.max())}), "
         f"episode length {result['length_mean']:.0f}"
+        + ("" if score.win_rate is None else f", won {score.win_rate:.1%}")
     )

@@ -8,13 +8,14 @@ from typing import get_args
 import tyro
 
 from race.config import Algo
-from race.presets import PRESETS, TABLE_3
+from race.presets import PRESETS, TABLES
 
 ALGORITHMS = {
     "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "
-    "maddpg)",
+    "maddpg, facmac)",
     "matd3": "MATD3: twin central critics, delayed policies, target smoothing",
     "maddpg": "MADDPG: one central critic",
+    "facmac": "FACMAC: the agents' utilities, mixed; for discrete actions too, recurrent there",
 }
 
 
@@ -39,8 +40,8 @@ def main(arguments: list[str]) -> None:
                 {
                     **info._asdict(),
                     **_battle_sizes(info.id),
-                    "alpha": TABLE_3.get(info.id, (None, None))[0],
-                    "beta": TABLE_3.get(info.id, (None, None))[1],
+                    "alpha": TABLES.get(info.id, (None, None))[0],
+                    "beta": TABLES.get(info.id, (None, None))[1],
                 }
                 for info in tasks
             ],
@@ -56,7 +57,7 @@ def main(arguments: list[str]) -> None:
     table = Table("task", "in the paper", "alpha", "beta", "what it is", title="Tasks")
     table.columns[0].no_wrap = True
     for info in tasks:
-        alpha, beta = TABLE_3.get(info.id, ("", ""))
+        alpha, beta = TABLES.get(info.id, ("", ""))
         table.add_row(info.id, info.paper_name or "", str(alpha), str(beta), info.description)
     console.print(table)
     console.print("Also your own: package.module:function, see docs/environments.md\n")
@@ -72,6 +73,9 @@ def main(arguments: list[str]) -> None:
             f"Adam {preset.actor_learning_rate:g}, {preset.random_steps:,} random steps",
         )
     console.print(presets)
+    console.print(
+        "Presets are for continuous actions; on discrete ones see race train --help, --facmac."
+    )
 
 
 def _battle_sizes(task_id: str) -> dict[str, int]:

@@ -20,7 +20,8 @@ class Plot:
     out: Path = Path("curves.png")
     """The figure: .png, .svg or .pdf."""
     metric: str = "return_mean"
-    """Quantity of the evaluations, or any key of metrics.jsonl such as injection/elite_rate."""
+    """Quantity of the evaluations (return_mean, win_rate, length_mean), or any key of metrics.jsonl
+    such as injection/elite_rate."""
     team: Literal["selected", "marl", "champion", "all"] = "selected"
     """Whose evaluations; methods without a population have the MARL team alone."""
 

@@ -97,6 +97,7 @@ def _test_summary(row: dict[str, Any]) -> str:
     return ", ".join(
         f"{labels[name]} {rounded(row[f'eval/{name}/return_mean'])} "
         f"± {rounded(row[f'eval/{name}/return_std'])}"
+        + (f" ({row[key]:.0%} won)" if (key := f"eval/{name}/win_rate") in row else "")
         for name in names
     )
 

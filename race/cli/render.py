@@ -1,9 +1,10 @@
 """``race render``."""
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
@@ -11,6 +12,8 @@ from race.config import TeamName
 from race.errors import ConfigError, RenderError
 
 PolicyName = Literal["scripted", "random"]
+STEPS_PER_SECOND = 2
+"""Of a battle, at the game's "normal" speed."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,6 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     from race.cli.compilation import use_cache
     from race.cli.progress import rounded
     from race.envs.micro import make, render
-    from race.envs.micro.environment import STEPS_PER_SECOND
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
     from race.rendering import write_video
@@ -115,29 +117,120 @@ def _render_run(chosen: Render, out: Path, seconds: float) -> None:
             "run: leave it out, or choose one of the run's teams with --team."
         )
     from rich.console import Console
-    from rich.progress import Progress
 
-    from race.rendering import Episode, choose_renderer, write_video
+    from race import run_directory
+    from race.cli.compilation import use_cache
 
     console = Console(stderr=True)
-    with console.status("looking for a renderer"):
-        renderer = choose_renderer()
-    console.print(f"Drawing with: {renderer.reason}", highlight=False, soft_wrap=True)
-    from race.cli.compilation import use_cache
-    from race.cli.progress import rounded
+    discrete = run_directory.open_run(Path(chosen.what)).discrete
+    renderer = None
+    if not discrete:
+        # mujoco reads what is chosen here when it is imported.
+        from race.rendering import choose_renderer
+
+        with console.status("looking for a renderer"):
+            renderer = choose_renderer()
+        console.print(f"Drawing with: {renderer.reason}", highlight=False, soft_wrap=True)
     from race.trained import load_trained
 
     use_cache()
-    team = chosen.team or "selected"
     with console.status("loading the team"):
         trained = load_trained(Path(chosen.what))
-        policy = trained.policy(team)
+    drawn = (
+        _draw_discrete(chosen, trained, seconds, console)
+        if renderer is None
+        else _continuous(chosen, trained, seconds, renderer)
+    )
+    _write(chosen, trained, drawn, out, console)
+
+
+class _Drawn(NamedTuple):
+    """A video to be, and what is said of it once it has been drawn."""
+
+    frames: Iterator[Any]
+    total: int
+    fps: float
+    summary: Callable[[], tuple[int, float, str]]  # steps, return, how it ended
+
+
+def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> _Drawn:
+    from race.rendering import Episode
+
+    policy = trained.policy(chosen.team or "selected")
     episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
+    return _Drawn(
+        episode.frames(),
+        episode.n_frames,
+        episode.fps,
+        lambda: (episode.steps, episode.episode_return, ""),
+    )
+
+
+def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -> _Drawn:
+    """The episode is played without pictures first, then its actions again with them."""
+    from race.rollouts.discrete import EpisodeRollouts
+
+    task = trained.config.task
+    if chosen.seed >= 2**31:
+        raise ConfigError(f"The --seed of an episode must be below {2**31}.")
+    # Without somebody to draw, there is nothing to play either.
+    env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
+    with (
+        console.status("playing the episode"),
+        EpisodeRollouts(trained.config, trained.task) as rollouts,
+    ):
+        head = trained.heads[trained.resolve(chosen.team or "selected")]
+        actions = rollouts.episode(trained.encoder, head, chosen.seed)
+    if env is not None:
+        steps = len(actions) if seconds == 0 else math.ceil(seconds * STEPS_PER_SECOND)
+        return _stepwise(env, actions[:steps], chosen.seed)
+    from race.envs.micro import make, render
+    from race.envs.micro.recording import replay
+
+    if seconds > 0:
+        actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
+    with console.status("playing it again"):
+        played = make(task.removeprefix("micro/"))
+        recording = replay(played, actions, chosen.seed)
+    ended = recording.verdict or "not finished"
+    return _Drawn(
+        render.frames(played, recording),
+        render.n_frames(recording),
+        render.FPS,
+        lambda: (len(recording.returns), float(recording.returns[-1]), ended),
+    )
+
+
+def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
+    total = 0.0
+
+    def frames() -> Iterator[Any]:
+        nonlocal total
+        try:
+            env.reset(seed=seed)
+            yield env.render()
+            for action in actions:
+                total += float(env.step(action)[1])
+                yield env.render()
+        finally:
+            env.close()
+
+    fps = float(env.metadata.get("render_fps") or STEPS_PER_SECOND)
+    return _Drawn(frames(), len(actions) + 1, fps, lambda: (len(actions), total, ""))
+
+
+def _write(chosen: Render, trained: Any, drawn: _Drawn, out: Path, console: Any) -> None:
+    from rich.progress import Progress
+
+    from race.cli.progress import rounded
+    from race.rendering import write_video
+
     with Progress(console=console, transient=True) as bar:
-        drawing = bar.track(episode.frames(), total=episode.n_frames, description="drawing")
-        count = write_video(iter(drawing), out, episode.fps)
-    name = {"marl": "MARL team", "champion": "champion"}[trained.resolve(team)]
+        drawing = bar.track(drawn.frames, total=drawn.total, description="drawing")
+        count = write_video(iter(drawing), out, drawn.fps)
+    name = {"marl": "MARL team", "champion": "champion"}[trained.resolve(chosen.team or "selected")]
+    steps, episode_return, ended = drawn.summary()
     print(
-        f"{out}: {count} frames, {episode.steps} steps of the {name}, "
-        f"return {rounded(episode.episode_return)}"
+        f"{out}: {count} frames, {steps} steps of the {name}, "
+        f"return {rounded(episode_return)}" + (f", {ended}" if ended else "")
     )

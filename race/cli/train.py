@@ -14,11 +14,13 @@ from race.config import (
     Config,
     EnvConfig,
     EvaluationConfig,
+    FacmacConfig,
     LearnerConfig,
     Preset,
     RaceConfig,
 )
 from race.presets import PRESETS, resolve
+from race.types import DiscreteTask
 
 
 @dataclass(frozen=True)
@@ -31,12 +33,12 @@ class Train:
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """The task, such as mamujoco/HalfCheetah-2x3 (`race list` shows all), or
+    """The task, such as mamujoco/HalfCheetah-2x3 or micro/2s3z (`race list` shows all), or
     package.module:function for your own."""
     algo: Algo = "race"
     """race, or one of its baselines without a population."""
-    base: Base = "matd3"
-    """The gradient learner inside race."""
+    base: Base | None = None
+    """The gradient learner inside race. None: matd3, on tasks with discrete actions facmac."""
     seed: int = 1
     """Seed of everything random: the same seed gives the same run."""
     env_steps: int = 1_000_000
@@ -47,6 +49,7 @@ class Train:
     """Learner settings to start from: the paper's, those of the official TD3 code, or small
     networks for a quick look."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
+    facmac: FacmacConfig = field(default_factory=FacmacConfig)
     race: RaceConfig = field(default_factory=RaceConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
@@ -56,22 +59,21 @@ class Train:
 def main(arguments: list[str]) -> None:
     """Parses the arguments, makes the run directory and trains."""
     chosen = _parse(arguments)
-    config = resolve(
-        Config(
-            **{
-                f.name: getattr(chosen, f.name)
-                for f in dataclasses.fields(Config)
-                if hasattr(chosen, f.name)
-            }
-        )
+    asked = Config(
+        **{
+            f.name: getattr(chosen, f.name)
+            for f in dataclasses.fields(Config)
+            if hasattr(chosen, f.name)
+        }
     )
-    # Not before the arguments are known to be good: these take a second to import.
+    # Not before the arguments are parsed: these take a second to import.
     from race import run_directory
     from race.cli.training import describe, run
     from race.envs import make_task
 
+    task = make_task(asked.task, asked.env)
+    config = resolve(asked, discrete=isinstance(task, DiscreteTask))
     path = chosen.run_dir or Path("runs") / _name(config)
-    task = make_task(config.task, config.env)
     run_directory.create(path, config, describe(task))
     run(path, config)
 

@@ -1,5 +1,6 @@
 """What ``race train`` and ``race resume`` share: the run itself, with its display."""
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,13 @@ from race.cli.compilation import use_cache
 from race.cli.progress import TrainingDisplay
 from race.config import Config
 from race.trainer import is_over, train
-from race.types import Task
+from race.types import AnyTask, DiscreteTask
 
 
-def describe(task: Task) -> dict[str, Any]:
+def describe(task: AnyTask) -> dict[str, Any]:
     """What metadata.json records of the environment."""
+    if isinstance(task, DiscreteTask):
+        return dataclasses.asdict(task.spec)
     spec = task.spec
     return {
         "task": spec.task,

@@ -14,14 +14,15 @@ import gymnasium
 import numpy as np
 
 from race.config import EnvConfig
-from race.envs import mamujoco, probe
+from race.envs import discrete_probe, mamujoco, probe
 from race.errors import TaskError
-from race.types import DiscreteTask, EnvSpec, Task
+from race.types import AnyTask, DiscreteTask, EnvSpec, Task
 
 __all__ = [
     "TaskInfo",
     "describe_tasks",
     "factorised",
+    "make_continuous_task",
     "make_discrete_task",
     "make_task",
     "task_ids",
@@ -58,6 +59,7 @@ def describe_tasks() -> tuple[TaskInfo, ...]:
         *_describe_battles(),
         *(TaskInfo(name, _describe(name), None) for name in others),
         *(TaskInfo(name, info.description, None) for name, info in probe.PROBES.items()),
+        *(TaskInfo(name, info.description, None) for name, info in discrete_probe.PROBES.items()),
     )
 
 
@@ -93,33 +95,29 @@ def _describe_battles() -> tuple[TaskInfo, ...]:
     )
 
 
-def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
+def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
     """The task of an id.
 
     Args:
         task_id: one of `task_ids`; any ``mamujoco/<Scenario>-<partition>`` that
             gymnasium-robotics knows; or your own as ``package.module:function``, where the
             function, called without arguments (or with `config`, if it takes one), returns a
-            `Task`. The module is also looked for in the current directory.
+            `Task` or a `DiscreteTask`. The module is also looked for in the current directory.
         config: what agents of Multi-Agent MuJoCo observe; its defaults, if not given.
 
     Raises:
-        TaskError: if there is no such task; the message names the nearest ones. Also for
-            ``micro/...``, whose actions are discrete (`make_discrete_task`).
+        TaskError: if there is no such task; the message names the nearest ones.
     """
     if task_id.startswith(_MICRO):
-        make_discrete_task(task_id)  # which knows better what is wrong with an unknown map
-        raise TaskError(
-            f"Task {task_id} has discrete actions, and the learners matd3 and maddpg control "
-            f"continuous ones only, so it cannot be trained on yet. `race render {task_id}` shows "
-            f"a battle, and race.envs.make_discrete_task({task_id!r}) makes the environment."
-        )
+        return make_discrete_task(task_id)
     if re.fullmatch(r"[\w.]+:\w+", task_id):
         return _own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
         return mamujoco.make_task(task_id, config)
     if task_id in probe.PROBES:
         return probe.make_task(task_id)
+    if task_id in discrete_probe.PROBES:
+        return discrete_probe.make_task(task_id)
     nearest = difflib.get_close_matches(task_id, task_ids(), n=3, cutoff=0.0)
     raise TaskError(
         f"There is no task {task_id!r}. The nearest names are {', '.join(nearest)}; `race list` "
@@ -127,12 +125,24 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
     )
 
 
+def make_continuous_task(task_id: str, config: EnvConfig = _DEFAULT) -> Task:
+    """`make_task` of a task with continuous actions.
+
+    Raises:
+        TaskError: if there is no such task, or its actions are discrete.
+    """
+    task = make_task(task_id, config)
+    if not isinstance(task, Task):
+        raise TaskError(f"Task {task_id} has discrete actions; this needs continuous ones.")
+    return task
+
+
 def make_discrete_task(task_id: str) -> DiscreteTask:
     """The task with discrete actions of an id.
 
     Args:
-        task_id: ``micro/<map>``, one of `task_ids`, or ``micro/<path>.toml`` for a map of your
-            own.
+        task_id: ``micro/<map>``, one of `task_ids`, ``micro/<path>.toml`` for a map of your own,
+            or a probe.
 
     Raises:
         TaskError: if there is no such map, its file is wrong, or the task is of another kind.
@@ -141,6 +151,8 @@ def make_discrete_task(task_id: str) -> DiscreteTask:
         from race.envs.micro import environment  # imports jax
 
         return environment.make_task(task_id)
+    if task_id in discrete_probe.PROBES:
+        return discrete_probe.make_task(task_id)
     battles = [info.id for info in _describe_battles()]
     nearest = difflib.get_close_matches(task_id, battles, n=3, cutoff=0.0)
     raise TaskError(
@@ -149,7 +161,7 @@ def make_discrete_task(task_id: str) -> DiscreteTask:
     )
 
 
-def _own_task(task_id: str, config: EnvConfig) -> Task:
+def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
     module_name, function_name = task_id.split(":")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
@@ -182,10 +194,11 @@ def _own_task(task_id: str, config: EnvConfig) -> Task:
         for parameter in inspect.signature(function).parameters.values()
     )
     task = function(config) if required else function()
-    if not isinstance(task, Task):
+    if not isinstance(task, Task | DiscreteTask):
         raise TaskError(
             f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "
-            "race.types.Task; race.envs.factorised builds one from a gymnasium environment."
+            "race.types.Task or DiscreteTask; race.envs.factorised builds the one from a gymnasium "
+            "environment, race.envs.pymarl.pymarl_task the other from a PyMARL-style one."
         )
     return task
 

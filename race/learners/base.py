@@ -3,39 +3,73 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 Values = Float[Array, "K B"]
+
+
+class Samples(NamedTuple):
+    """The steps of a minibatch, ``B`` in all: where actions were taken, and which."""
+
+    moments: Any
+    """What the networks see there; only the learner looks into it."""
+    action: Array
+    """The joint actions, in the form that the learner's critics take."""
+    mask: Float[Array, "B"] | None
+    """1 where a step is real, 0 where it is padding; None if all are real."""
 
 
 class Learner(NamedTuple):
     """A base MARL method: pure functions over its networks.
 
-    ``spec`` is the task's `EnvSpec` and ``config`` the `LearnerConfig`; parameters of networks
-    are pytrees that only the learner looks into.
+    ``spec`` is the task's spec and ``config`` the whole `Config`; parameters of networks are
+    pytrees that only the learner looks into. ``B`` samples of a minibatch are transitions or the
+    steps of whole episodes; ``B'`` moments are those at which targets are evaluated.
     """
 
     init_encoder: Callable[..., Any]
-    """(key, spec, config) -> encoders of all agents."""
-    init_head: Callable[..., Float[Array, "N H1 A"]]
-    """(key, spec, config) -> one team's policy representations."""
+    """(key, spec, config) -> the encoders of all agents."""
+    init_head: Callable[..., Float[Array, "_ H1 A"]]
+    """(key, spec, config) -> the MARL team's policy representations: one per agent, or one that
+    all agents share."""
+    init_heads: Callable[..., Float[Array, "N H1 A"]]
+    """(key, spec, config) -> those of a team of the population, one per agent."""
     init_critic: Callable[..., Any]
     """(key, spec, config) -> the MARL critic Q_psi."""
     init_pevfa: Callable[..., Any]
-    """(key, spec, config, embedding_size) -> the PeVFA Q_theta."""
-    encode: Callable[..., Float[Array, "N B H"]]
-    """(encoder, spec, state [B, S]) -> embeddings z of every agent."""
-    act: Callable[..., Float[Array, "B U"]]
-    """(z, head, spec) -> the team's joint action."""
-    smooth: Callable[..., Float[Array, "B U"]]
-    """(action, key, config) -> the action at which a target is evaluated."""
+    """(key, spec, config) -> the PeVFA Q_theta."""
+    init_value: Callable[..., Any]
+    """(key, spec, config) -> the state-value net V_zeta."""
+    init_mine: Callable[..., Any]
+    """(key, spec, config) -> MINE networks T_omega, one per encoder."""
+    now: Callable[..., Samples]
+    """(batch, spec) -> the steps of a minibatch."""
+    later: Callable[..., Any]
+    """(batch, spec) -> the moments that targets need."""
+    encode: Callable[..., Float[Array, "..."]]
+    """(encoder, moments, spec) -> embeddings z of every agent."""
+    act: Callable[..., Array]
+    """(z, head, moments, key, spec) -> the team's joint actions, through which policies are
+    trained."""
+    target_action: Callable[..., Array]
+    """(z, head, moments, key, spec, config) -> the joint actions at which a target is evaluated."""
     q_marl: Callable[..., Values]
-    """(critic, state, action) -> Q_psi(s, u) of each critic."""
+    """(critic, moments, action, spec) -> Q_psi(s, u) of each critic."""
     q_team: Callable[..., Values]
-    """(pevfa, spec, state, action, head) -> Q_theta(s, u, W) of each critic."""
+    """(pevfa, moments, action, head, spec) -> Q_theta(s, u, W) of each critic."""
     pessimistic: Callable[[Values], Float[Array, "B"]]
     """The value that targets use, of the ensemble's."""
+    td_target: Callable[..., Float[Array, "B"]]
+    """(batch, values [B'], config) -> the targets y of Eq. (1)."""
     first_critic: Callable[[Any], Any]
     """The part of a critic (of Q_psi) that policies maximise."""
     first_pevfa: Callable[[Any], Any]
     """The part of a PeVFA (of Q_theta) that encoders maximise."""
+    state_values: Callable[..., Float[Array, "B"]]
+    """(value, moments) -> V_zeta(s)."""
+    mutual_information: Callable[..., Float[Array, "M B"]]
+    """(mine, moments, z, key) -> the signals I_t below Eq. (3) of each MINE."""
+    policy_due: Callable[..., bool | Bool[Array, ""]]
+    """(step, config) -> whether this gradient step also trains policies and moves targets."""
+    follow: Callable[..., Any]
+    """(target, online, step, config) -> the targets after this gradient step."""

@@ -1,27 +1,26 @@
 """MADDPG: MATD3 with a single critic.
 
-`race.config.resolve` sets the policy delay to 1 and the smoothing noise to 0 for it, which takes
+`race.presets.resolve` sets the policy delay to 1 and the smoothing noise to 0 for it, which takes
 the other two of TD3's additions away.
 """
 
 from jaxtyping import PRNGKeyArray
 
-from race.config import LearnerConfig
+from race.config import Config
 from race.critics import Critic, Pevfa, init_critic, init_pevfa
 from race.learners.matd3 import matd3
 from race.types import EnvSpec
 
 
-def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig) -> Critic:
+def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Critic:
     """A fresh critic, an ensemble of one."""
-    return init_critic(key, spec, config.hidden_sizes, 1)
+    return init_critic(key, spec, config.learner.hidden_sizes, 1)
 
 
-def new_pevfa(
-    key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig, embedding_size: int
-) -> Pevfa:
+def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Pevfa:
     """A fresh PeVFA, an ensemble of one."""
-    return init_pevfa(key, spec, config.hidden_sizes, 1, embedding_size)
+    size = config.race.policy_embedding_size
+    return init_pevfa(key, spec, config.learner.hidden_sizes, 1, size)
 
 
 maddpg = matd3._replace(init_critic=new_critic, init_pevfa=new_pevfa)

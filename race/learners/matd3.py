@@ -6,59 +6,120 @@ Fujimoto et al. 2018). The actors are the encoder and linear head of Table 1, al
 population, so that RACE and its baseline differ in nothing else.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race.config import LearnerConfig
-from race.critics import (
-    Critic,
-    Pevfa,
-    first_critic,
-    first_pevfa,
-    init_critic,
-    init_pevfa,
-    pevfa_values,
-    q_values,
-)
-from race.learners.base import Learner
-from race.networks import Encoder, act, encode, init_encoder, init_head
-from race.types import EnvSpec
+from race import critics, networks
+from race.config import Config
+from race.critics import Critic, Pevfa, StateValue, first_critic, first_pevfa
+from race.equations import mutual_information_signal, td_target
+from race.learners.base import Learner, Samples
+from race.networks import Encoder, Mine, mine_scores
+from race.optimization import track
+from race.types import EnvSpec, Transition
 
 N_CRITICS = 2
 
 
-def new_encoder(key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig) -> Encoder:
+def new_encoder(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Encoder:
     """Fresh encoders of all agents."""
-    return init_encoder(key, spec, config.hidden_sizes)
+    return networks.init_encoder(key, spec, config.learner.hidden_sizes)
 
 
-def new_head(key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig) -> Float[Array, "N H1 A"]:
+def new_head(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Float[Array, "N H1 A"]:
     """A fresh team."""
-    return init_head(key, spec, config.hidden_sizes[1])
+    return networks.init_head(key, spec, config.learner.hidden_sizes[1])
 
 
-def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig) -> Critic:
+def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Critic:
     """A fresh twin critic."""
-    return init_critic(key, spec, config.hidden_sizes, N_CRITICS)
+    return critics.init_critic(key, spec, config.learner.hidden_sizes, N_CRITICS)
 
 
-def new_pevfa(
-    key: PRNGKeyArray, spec: EnvSpec, config: LearnerConfig, embedding_size: int
-) -> Pevfa:
+def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Pevfa:
     """A fresh twin PeVFA."""
-    return init_pevfa(key, spec, config.hidden_sizes, N_CRITICS, embedding_size)
+    size = config.race.policy_embedding_size
+    return critics.init_pevfa(key, spec, config.learner.hidden_sizes, N_CRITICS, size)
 
 
-def smooth(
-    action: Float[Array, "B U"], key: PRNGKeyArray, config: LearnerConfig
+def new_value(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> StateValue:
+    """A fresh state-value net."""
+    return critics.init_state_value(key, spec.state_size, config.learner.hidden_sizes)
+
+
+def new_mine(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Mine:
+    """One fresh MINE network per agent."""
+    return networks.init_mine(key, spec, config.learner.hidden_sizes[1], config.race.mine_size)
+
+
+def now(batch: Transition, spec: EnvSpec) -> Samples:
+    """All transitions are real; the networks see the states."""
+    return Samples(batch.state, batch.action, None)
+
+
+def later(batch: Transition, spec: EnvSpec) -> Float[Array, "B S"]:
+    """The next states."""
+    state: Array = batch.next_state
+    return state
+
+
+def encode(encoder: Encoder, state: Float[Array, "B S"], spec: EnvSpec) -> Float[Array, "N B H"]:
+    """Embeddings of every agent's observation."""
+    return networks.encode(encoder, spec, state)
+
+
+def act(
+    z: Float[Array, "N B H"],
+    head: Float[Array, "N H1 A"],
+    state: Float[Array, "B S"],
+    key: PRNGKeyArray,
+    spec: EnvSpec,
 ) -> Float[Array, "B U"]:
+    """The policies are deterministic."""
+    return networks.act(z, head, spec)
+
+
+def smooth(action: Float[Array, "B U"], key: PRNGKeyArray, config: Config) -> Float[Array, "B U"]:
     """Target policy smoothing: clipped Gaussian noise, then the action's own bounds."""
-    if config.smoothing_noise == 0:
+    hyper = config.learner
+    if hyper.smoothing_noise == 0:
         return action
-    noise = config.smoothing_noise * jax.random.normal(key, action.shape, action.dtype)
-    noise = jnp.clip(noise, -config.smoothing_clip, config.smoothing_clip)
+    noise = hyper.smoothing_noise * jax.random.normal(key, action.shape, action.dtype)
+    noise = jnp.clip(noise, -hyper.smoothing_clip, hyper.smoothing_clip)
     return jnp.clip(action + noise, -1.0, 1.0)
+
+
+def target_action(
+    z: Float[Array, "N B H"],
+    head: Float[Array, "N H1 A"],
+    state: Float[Array, "B S"],
+    key: PRNGKeyArray,
+    spec: EnvSpec,
+    config: Config,
+) -> Float[Array, "B U"]:
+    """The policies' actions, smoothed."""
+    return smooth(networks.act(z, head, spec), key, config)
+
+
+def q_marl(
+    critic: Critic, state: Float[Array, "B S"], action: Float[Array, "B U"], spec: EnvSpec
+) -> Float[Array, "K B"]:
+    """``Q_psi(s, u)`` of each critic."""
+    return critics.q_values(critic, state, action)
+
+
+def q_team(
+    pevfa: Pevfa,
+    state: Float[Array, "B S"],
+    action: Float[Array, "B U"],
+    head: Float[Array, "N H1 A"],
+    spec: EnvSpec,
+) -> Float[Array, "K B"]:
+    """``Q_theta(s, u, W)`` of each critic."""
+    return critics.pevfa_values(pevfa, spec, state, action, head)
 
 
 def smaller(values: Float[Array, "K B"]) -> Float[Array, "B"]:
@@ -66,18 +127,57 @@ def smaller(values: Float[Array, "K B"]) -> Float[Array, "B"]:
     return jnp.min(values, axis=0)
 
 
+def one_step_target(
+    batch: Transition, next_value: Float[Array, "B"], config: Config
+) -> Float[Array, "B"]:
+    """The target of Eq. (1)."""
+    return td_target(batch.reward, batch.terminated, next_value, config.learner.discount)
+
+
+def state_values(value: StateValue, state: Float[Array, "B S"]) -> Float[Array, "B"]:
+    """``V_zeta(s)``."""
+    return critics.state_values(value, state)
+
+
+def mutual_information(
+    mine: Mine, state: Float[Array, "B S"], z: Float[Array, "N B H"], key: PRNGKeyArray
+) -> Float[Array, "N B"]:
+    """Signals of every agent; the other samples of the batch are the negatives."""
+    return jax.vmap(mutual_information_signal)(mine_scores(mine, state, z))
+
+
+def policy_due(step: Int[Array, ""], config: Config) -> Bool[Array, ""]:
+    """Every ``policy_delay``-th step."""
+    return (step + 1) % config.learner.policy_delay == 0
+
+
+def follow(target: Any, online: Any, step: Int[Array, ""], config: Config) -> Any:
+    """Targets move a little towards the networks."""
+    return track(target, online, config.learner.target_update_rate)
+
+
 matd3 = Learner(
     init_encoder=new_encoder,
     init_head=new_head,
+    init_heads=new_head,
     init_critic=new_critic,
     init_pevfa=new_pevfa,
+    init_value=new_value,
+    init_mine=new_mine,
+    now=now,
+    later=later,
     encode=encode,
     act=act,
-    smooth=smooth,
-    q_marl=q_values,
-    q_team=pevfa_values,
+    target_action=target_action,
+    q_marl=q_marl,
+    q_team=q_team,
     pessimistic=smaller,
+    td_target=one_step_target,
     first_critic=first_critic,
     first_pevfa=first_pevfa,
+    state_values=state_values,
+    mutual_information=mutual_information,
+    policy_due=policy_due,
+    follow=follow,
 )
 """MATD3, the paper's base method on continuous tasks."""

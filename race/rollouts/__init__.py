@@ -1,1 +1,17 @@
-"""Episodes of several teams at once."""
+"""Teams playing episodes."""
+
+from race.config import Config
+from race.rollouts.base import Rollouts
+from race.rollouts.discrete import EpisodeRollouts
+from race.rollouts.transitions import TransitionRollouts
+from race.types import AnyTask, Task
+
+
+def rollouts_of(config: Config, task: AnyTask) -> Rollouts:
+    """The rollouts of a task, for a run of a resolved configuration."""
+    if isinstance(task, Task):
+        return TransitionRollouts(config, task)
+    return EpisodeRollouts(config, task)
+
+
+__all__ = ["Rollouts", "rollouts_of"]

@@ -32,10 +32,10 @@ class Case:
         self.state = self.init(0)
         self.batch = batch_of(spec, 3)
         self.update = compiled(algorithm, "update", spec, config)
-        # Evolution knows no learner: one program serves both.
+        # Evolution knows no learner: one program serves all.
         matd3 = dataclasses.replace(config, base="matd3", learner=LearnerConfig())
         self.evolve = compiled(algorithm, "evolve", spec, matd3)
-        self.population = self.algorithm.teams(self.state).heads.shape[0] - 1
+        self.population = self.algorithm.teams(self.state, self.spec).heads.shape[0] - 1
         self.fitness = jnp.arange(max(1, self.population), dtype=jnp.float32)
 
     def init(self, seed: int) -> Any:
@@ -43,7 +43,9 @@ class Case:
 
 
 @pytest.fixture(
-    scope="module", params=[(a, b) for a in ALGORITHMS for b in ("matd3", "maddpg")], ids="-".join
+    scope="module",
+    params=[(a, b) for a in ALGORITHMS for b in ("matd3", "maddpg", "facmac")],
+    ids="-".join,
 )
 def case(
     request: Any,
@@ -107,7 +109,7 @@ def test_functions_keep_structure_shapes_and_types(case: Case) -> None:
 def test_teams_champion_and_counts(case: Case) -> None:
     population = case.config.race.population_size if case.config.has_population else 0
     assert case.population == population
-    heads = case.algorithm.teams(case.state).heads
+    heads = case.algorithm.teams(case.state, case.spec).heads
     h1 = case.config.learner.hidden_sizes[1] + 1
     assert heads.shape == (population + 1, case.spec.n_agents, h1, case.spec.action_size)
     assert case.algorithm.champion(case.state).shape == heads.shape[1:]
@@ -123,7 +125,7 @@ def test_fresh_targets_equal_the_networks_and_no_two_teams_are_alike(case: Case)
     assert_equal(state.target.critic, critic.params)
     if case.algorithm is race:
         assert_equal(state.target.pevfa, state.critics.pevfa.params)
-    heads = case.algorithm.teams(state).heads
+    heads = case.algorithm.teams(state, case.spec).heads
     assert len(np.unique(heads[:, 0, 0, 0])) == len(heads)
 
 
@@ -205,6 +207,23 @@ def with_junk_in_padding(case: Case) -> Any:
         weight = jnp.where(obs_rows[:, :, None], 1e3, encoder.hidden.weight)
         return type(encoder)(type(encoder.hidden)(weight, encoder.hidden.bias), encoder.out)
 
+    def spoil_critic(critic: Any) -> Any:
+        """The factored critic alone has inputs that are padded."""
+        if case.config.base != "facmac":
+            return critic
+        utilities = critic.utilities
+        rows = np.concatenate([obs_rows, ~np.asarray(case.spec.action_mask)], axis=1)
+        weight = jnp.where(rows[:, :, None], 1e3, utilities.first.weight)
+        first = type(utilities.first)(weight, utilities.first.bias)
+        spoiled = type(utilities)(first, utilities.hidden, utilities.out)
+        return type(critic)(spoiled, critic.mixer)
+
+    def spoil_pevfa(pevfa: Any) -> Any:
+        if case.config.base != "facmac":
+            return pevfa
+        critic = spoil_critic(pevfa.critic)
+        return type(pevfa)(critic, pevfa.embedding, pevfa.utility_weight, pevfa.mixer_weight)
+
     def spoil_head(head: Any) -> Any:
         return jnp.where(jnp.asarray(columns), 1e3, head)
 
@@ -216,13 +235,23 @@ def with_junk_in_padding(case: Case) -> Any:
 
     state = case.state
     target = state.target._replace(
-        encoder=spoil_encoder(state.target.encoder), head=spoil_head(state.target.head)
+        encoder=spoil_encoder(state.target.encoder),
+        head=spoil_head(state.target.head),
+        critic=spoil_critic(state.target.critic),
     )
-    state = state._replace(target=target)
-    if case.algorithm is race:
-        heads = jnp.where(jnp.asarray(columns)[None], 1e3, state.heads)
-        return state._replace(policies=spoil(state.policies), heads=heads)
-    return spoil(state)
+    if case.algorithm is not race:
+        critic = state.critic._replace(params=spoil_critic(state.critic.params))
+        return spoil(state._replace(target=target, critic=critic))
+    critics = state.critics._replace(
+        critic=state.critics.critic._replace(params=spoil_critic(state.critics.critic.params)),
+        pevfa=state.critics.pevfa._replace(params=spoil_pevfa(state.critics.pevfa.params)),
+    )
+    return state._replace(
+        target=target._replace(pevfa=spoil_pevfa(target.pevfa)),
+        critics=critics,
+        policies=spoil(state.policies),
+        heads=jnp.where(jnp.asarray(columns)[None], 1e3, state.heads),
+    )
 
 
 def test_padding_changes_no_loss_and_no_other_parameter(case: Case) -> None:
@@ -244,7 +273,7 @@ def test_padded_columns_stay_zero(case: Case, batch_of: Callable[..., Any]) -> N
             state, batch_of(case.spec, 3, step), jnp.int32(step), jax.random.key(step)
         )
         state = case.algorithm.inject(case.evolve(state, case.fitness, jax.random.key(step)))
-    heads = np.asarray(case.algorithm.teams(state).heads)
+    heads = np.asarray(case.algorithm.teams(state, case.spec).heads)
     padded = ~np.broadcast_to(np.asarray(case.spec.action_mask)[:, None], heads.shape)
     assert (heads[padded] == 0).all()
     assert (heads[~padded] != 0).all()
@@ -264,7 +293,7 @@ def race_case(
 
 
 def test_all_teams_act_over_the_same_encoders_and_the_marl_team_is_last(race_case: Case) -> None:
-    teams = race.teams(race_case.state)
+    teams = race.teams(race_case.state, race_case.spec)
     assert_equal(teams.encoder, race_case.state.policies.encoder.params)
     assert_equal(teams.heads[:-1], race_case.state.heads)
     assert_equal(teams.heads[-1], race_case.state.policies.head.params)

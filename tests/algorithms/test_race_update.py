@@ -15,11 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from float64_factored import q_tot, q_tot_team
 
 from race.algorithms import marl, race
 from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
 from race.config import Config
+from race.factored import FactoredCritic, FactoredPevfa
 from race.types import EnvSpec
 
 B = 3
@@ -51,7 +53,10 @@ def pi(encoder: Any, head: np.ndarray, spec: EnvSpec, s: np.ndarray) -> np.ndarr
     return u
 
 
-def q_psi(critic: Any, k: int, s: np.ndarray, u: np.ndarray) -> float:
+def q_psi(critic: Any, k: int, spec: EnvSpec, s: np.ndarray, u: np.ndarray) -> float:
+    if isinstance(critic, FactoredCritic):
+        assert k == 0
+        return q_tot(critic, spec, s, u)
     x = leaky(np.concatenate([s, u]) @ critic.first.weight[k] + critic.first.bias[k])
     x = leaky(x @ critic.hidden.weight[k] + critic.hidden.bias[k])
     return float((x @ critic.out.weight[k] + critic.out.bias[k])[0])
@@ -71,6 +76,9 @@ def embedding(pevfa: Any, spec: EnvSpec, head: np.ndarray) -> np.ndarray:
 def q_theta(
     pevfa: Any, k: int, spec: EnvSpec, s: np.ndarray, u: np.ndarray, head: np.ndarray
 ) -> float:
+    if isinstance(pevfa, FactoredPevfa):
+        assert k == 0
+        return q_tot_team(pevfa, spec, s, u, embedding(pevfa, spec, head))
     critic = pevfa.critic
     first = np.concatenate([critic.first.weight[k], pevfa.embedding_weight[k]])
     x = np.concatenate([s, u, embedding(pevfa, spec, head)])
@@ -120,7 +128,7 @@ def targets_of(f: Frozen) -> tuple[np.ndarray, np.ndarray]:
         u_marl = np.clip(pi(f.target.encoder, f.target.head, f.spec, s) + f.noise[0][b], -1, 1)
         u_team = np.clip(pi(f.target.encoder, f.team, f.spec, s) + f.noise[1][b], -1, 1)
         ks = range(f.n_critics)
-        next_marl = min(q_psi(f.target.critic, k, s, u_marl) for k in ks)
+        next_marl = min(q_psi(f.target.critic, k, f.spec, s, u_marl) for k in ks)
         next_team = min(q_theta(f.target.pevfa, k, f.spec, s, u_team, f.team) for k in ks)
         alive = f.discount if f.batch.terminated[b] == 0 else 0.0
         y_marl.append(f.batch.reward[b] + alive * next_marl)
@@ -131,7 +139,7 @@ def targets_of(f: Frozen) -> tuple[np.ndarray, np.ndarray]:
 def critic_loss(critic: Any, f: Frozen, y: np.ndarray) -> float:
     s, u = f.batch.state, f.batch.action
     return sum(
-        float(np.mean([(y[b] - q_psi(critic, k, s[b], u[b])) ** 2 for b in range(len(y))]))
+        float(np.mean([(y[b] - q_psi(critic, k, f.spec, s[b], u[b])) ** 2 for b in range(len(y))]))
         for k in range(f.n_critics)
     )
 
@@ -158,7 +166,7 @@ def vfm_loss(encoder: Any, head: np.ndarray, critic: Any, pevfa: Any, f: Frozen)
     """Eq. (2)."""
     total = 0.0
     for s in f.batch.state:
-        total += q_psi(critic, 0, s, pi(encoder, head, f.spec, s))
+        total += q_psi(critic, 0, f.spec, s, pi(encoder, head, f.spec, s))
         total += q_theta(pevfa, 0, f.spec, s, pi(encoder, f.team, f.spec, s), f.team)
     return -total / len(f.batch.state)
 
@@ -173,7 +181,9 @@ def vmm_loss(encoder: Any, mine: Any, values: np.ndarray, f: Frozen, agent: int)
 def marl_loss(encoder: Any, head: np.ndarray, critic: Any, f: Frozen) -> float:
     """Eq. (7)."""
     s_all = f.batch.state
-    return -float(np.mean([q_psi(critic, 0, s, pi(encoder, head, f.spec, s)) for s in s_all]))
+    return -float(
+        np.mean([q_psi(critic, 0, f.spec, s, pi(encoder, head, f.spec, s)) for s in s_all])
+    )
 
 
 def numeric_gradient(loss: Callable[[Any], float], params: Any, step: float = 1e-6) -> Any:
@@ -256,7 +266,7 @@ def drawn_team(before: Any, pevfa_loss_seen: float, f: Frozen) -> np.ndarray:
     return team
 
 
-@pytest.fixture(scope="module", params=["matd3", "maddpg"])
+@pytest.fixture(scope="module", params=["matd3", "maddpg", "facmac"])
 def stepped(
     request: Any,
     tiny_spec: EnvSpec,

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from race.config import EnvConfig
-from race.envs import describe_tasks, factorised, make_task, task_ids
+from race.envs import (
+    describe_tasks,
+    factorised,
+    make_continuous_task,
+    make_task,
+    task_ids,
+)
 from race.envs.micro import load_map, map_names
 from race.errors import TaskError
 from race.presets import TABLE_3
 from race.rollouts.host import EnvPool, collect
+from race.types import DiscreteTask, Task
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "environments.md"
 
@@ -52,6 +59,16 @@ def test_battles_are_described_without_importing_jax():
 def test_nearest_names():
     with pytest.raises(TaskError, match=r"mamujoco/Hopper-3x1"):
         make_task("Hopper-3x1")
+
+
+def test_every_kind_of_task_is_made_and_the_narrow_maker_refuses_discrete_ones():
+    for task_id, kind in (("probe/chain", Task), ("micro/2s3z", DiscreteTask)):
+        task = make_task(task_id)
+        assert isinstance(task, kind)
+        assert task.spec.task == task_id
+    assert make_continuous_task("probe/chain").spec == make_task("probe/chain").spec
+    with pytest.raises(TaskError, match="discrete actions"):
+        make_continuous_task("micro/2s3z")
 
 
 def test_the_documents_example_works(directory):

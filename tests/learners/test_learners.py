@@ -1,4 +1,4 @@
-"""What MATD3 and MADDPG add to the networks: ensembles, smoothing, pessimism."""
+"""What the learners of continuous actions add to the networks: ensembles, smoothing, pessimism."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,30 +9,44 @@ import numpy as np
 import pytest
 
 from race.config import Config, LearnerConfig
-from race.learners import LEARNERS, matd3
+from race.learners import LEARNERS, facmac, learner_of
+from race.learners.base import Learner
+from race.learners.matd3 import smooth
 from race.presets import resolve
-from race.types import EnvSpec
+from race.types import EnvSpec, Transition
+
+KEY = jax.random.key(9)
 
 
-@pytest.mark.parametrize(("base", "count"), [("matd3", 2), ("maddpg", 1)])
+@pytest.mark.parametrize(("base", "count"), [("matd3", 2), ("maddpg", 1), ("facmac", 1)])
 def test_number_of_critics(
     tiny_spec: EnvSpec, tiny_config: Callable[..., Config], base: str, count: int
 ) -> None:
-    learner, hyper = LEARNERS[base], tiny_config("race", base).learner
+    learner, config = LEARNERS[base], tiny_config("race", base)
     state, action = jnp.ones((3, 4)), jnp.zeros((3, 3))
-    critic = learner.init_critic(jax.random.key(0), tiny_spec, hyper)
-    pevfa = learner.init_pevfa(jax.random.key(1), tiny_spec, hyper, 3)
-    head = learner.init_head(jax.random.key(2), tiny_spec, hyper)
-    encoder = learner.init_encoder(jax.random.key(3), tiny_spec, hyper)
-    q_marl = learner.q_marl(critic, state, action)
-    q_team = learner.q_team(pevfa, tiny_spec, state, action, head)
+    critic = learner.init_critic(jax.random.key(0), tiny_spec, config)
+    pevfa = learner.init_pevfa(jax.random.key(1), tiny_spec, config)
+    head = learner.init_head(jax.random.key(2), tiny_spec, config)
+    encoder = learner.init_encoder(jax.random.key(3), tiny_spec, config)
+    q_marl = learner.q_marl(critic, state, action, tiny_spec)
+    q_team = learner.q_team(pevfa, state, action, head, tiny_spec)
     assert q_marl.shape == q_team.shape == (count, 3)
     # Policies maximise the first critic alone.
-    first = learner.q_marl(learner.first_critic(critic), state, action)
+    first = learner.q_marl(learner.first_critic(critic), state, action, tiny_spec)
     assert jnp.array_equal(first, q_marl[:1])
-    first = learner.q_team(learner.first_pevfa(pevfa), tiny_spec, state, action, head)
+    first = learner.q_team(learner.first_pevfa(pevfa), state, action, head, tiny_spec)
     assert jnp.array_equal(first, q_team[:1])
-    assert learner.act(learner.encode(encoder, tiny_spec, state), head, tiny_spec).shape == (3, 3)
+    z = learner.encode(encoder, state, tiny_spec)
+    assert learner.act(z, head, state, KEY, tiny_spec).shape == (3, 3)
+
+
+@pytest.mark.parametrize("base", LEARNERS)
+def test_heads_of_both_kinds_of_teams_are_one_per_agent(
+    tiny_spec: EnvSpec, tiny_config: Callable[..., Config], base: str
+) -> None:
+    learner, config = LEARNERS[base], tiny_config("race", base)
+    for init in (learner.init_head, learner.init_heads):
+        assert init(KEY, tiny_spec, config).shape == (2, 5, 2)
 
 
 @pytest.mark.parametrize("base", LEARNERS)
@@ -42,9 +56,48 @@ def test_targets_use_the_smallest_value(base: str) -> None:
     assert LEARNERS[base].pessimistic(values[:1]).tolist() == [1.0, 5.0, -2.0]
 
 
+@pytest.mark.parametrize("base", LEARNERS)
+def test_a_minibatch_is_its_transitions(
+    tiny_spec: EnvSpec,
+    tiny_config: Callable[..., Config],
+    batch_of: Callable[..., Transition],
+    base: str,
+) -> None:
+    learner, config, batch = LEARNERS[base], tiny_config("race", base), batch_of(tiny_spec, 3)
+    state, action, mask = learner.now(batch, tiny_spec)
+    assert mask is None  # all are real
+    assert jnp.array_equal(state, batch.state)
+    assert jnp.array_equal(action, batch.action)
+    assert jnp.array_equal(learner.later(batch, tiny_spec), batch.next_state)
+    # The second sample terminated.
+    y = learner.td_target(batch, jnp.array([10.0, 20.0, 30.0]), config)
+    np.testing.assert_allclose(y, batch.reward + jnp.array([9.9, 0.0, 29.7]), rtol=1e-6)
+
+
+@pytest.mark.parametrize(("base", "delay"), [("matd3", 2), ("maddpg", 1), ("facmac", 1)])
+def test_policies_are_due_after_every_delay(
+    tiny_config: Callable[..., Config], base: str, delay: int
+) -> None:
+    learner, config = LEARNERS[base], tiny_config("race", base)
+    due = [bool(learner.policy_due(jnp.int32(step), config)) for step in range(6)]
+    assert due == [(step + 1) % delay == 0 for step in range(6)]
+
+
+@pytest.mark.parametrize("discrete", [False, True])
+@pytest.mark.parametrize("base", LEARNERS)
+def test_a_configuration_names_its_learner(base: str, discrete: bool) -> None:
+    if discrete and base != "facmac":
+        pytest.skip("there is one learner of discrete actions")
+    config = resolve(Config(task="t", base=base), discrete=discrete)  # type: ignore[arg-type]
+    expected = facmac if discrete else LEARNERS[base]
+    assert learner_of(config) is expected
+    alone = resolve(Config(task="t", algo=base), discrete=discrete)  # type: ignore[arg-type]
+    assert learner_of(alone) is expected
+
+
 def smoothed(action: Any, **settings: float) -> np.ndarray:
-    config = LearnerConfig(**settings)  # type: ignore[arg-type]
-    return np.asarray(matd3.smooth(action, jax.random.key(4), config))
+    config = Config(task="t", learner=LearnerConfig(**settings))  # type: ignore[arg-type]
+    return np.asarray(smooth(action, jax.random.key(4), config))
 
 
 def test_smoothing_is_clipped_gaussian_noise() -> None:
@@ -69,9 +122,38 @@ def test_smoothing_draws_each_entry_for_itself() -> None:
     assert len(np.unique(noise)) == 150
 
 
-def test_maddpg_is_neither_smoothed_nor_delayed() -> None:
-    hyper = resolve(Config(task="t", algo="maddpg")).learner
+def actions(
+    learner: Learner, spec: EnvSpec, config: Config, key: jax.Array
+) -> tuple[np.ndarray, np.ndarray]:
+    """A team's actions in 50 states, and those at which a target is evaluated."""
+    encoder = learner.init_encoder(jax.random.key(1), spec, config)
+    head = learner.init_head(jax.random.key(2), spec, config)
+    state = jax.random.normal(jax.random.key(3), (50, spec.state_size))
+    z = learner.encode(encoder, state, spec)
+    plain = learner.act(z, head, state, key, spec)
+    return np.asarray(plain), np.asarray(learner.target_action(z, head, state, key, spec, config))
+
+
+def test_matd3s_targets_are_at_smoothed_actions_of_the_policies(
+    tiny_spec: EnvSpec, tiny_config: Callable[..., Config]
+) -> None:
+    config = tiny_config("race", "matd3", {"smoothing_noise": 0.2, "smoothing_clip": 0.3})
+    plain, noisy = actions(LEARNERS["matd3"], tiny_spec, config, KEY)
+    assert (np.abs(noisy - plain) < 0.3 + 1e-6).all()
+    assert (noisy != plain).mean() > 0.99
+    assert np.abs(noisy - plain).std() > 0.05
+    again, other = (
+        actions(LEARNERS["matd3"], tiny_spec, config, key)[1] for key in (KEY, jax.random.key(1))
+    )
+    assert np.array_equal(again, noisy)
+    assert not np.array_equal(other, noisy)
+
+
+@pytest.mark.parametrize("base", ["maddpg", "facmac"])
+def test_maddpg_and_facmac_are_neither_smoothed_nor_delayed(tiny_spec: EnvSpec, base: str) -> None:
+    config = resolve(Config(task="t", algo=base))  # type: ignore[arg-type]
+    plain, target = actions(LEARNERS[base], tiny_spec, config, KEY)
+    assert np.array_equal(plain, target)
+    assert config.learner.policy_delay == 1
     action = jnp.full((3, 2), 0.3)
-    smooth = LEARNERS["maddpg"].smooth(action, jax.random.key(0), hyper)
-    assert jnp.array_equal(smooth, action)
-    assert hyper.policy_delay == 1
+    assert jnp.array_equal(smooth(action, jax.random.key(0), config), action)

@@ -73,6 +73,34 @@ def play(played: Battle, policy: Policy, seed: int, most_steps: int | None = Non
     return Recording(units, np.cumsum(np.array(rewards, np.float64)), verdict)
 
 
+def replay(played: Battle, actions: Int[Any, "steps n"], seed: int) -> Recording:
+    """The battle that a `race.envs.micro.environment.MicroEnv` with this seed makes of actions.
+
+    Args:
+        played: the map.
+        actions: of all agents at every step; what comes after the end is ignored.
+        seed: of everything random, below 2**32.
+    """
+    key, now = jax.random.split(jax.random.key(seed))
+    env_state, _ = played.reset(now)
+    films = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], env_state.units)]
+    rewards: list[float] = []
+    verdict = ""
+    for chosen in actions:
+        key, now = jax.random.split(key)
+        env_state, timestep, film = _film(played.scenario, env_state, jnp.asarray(chosen), now)
+        films.append(jax.tree.map(np.asarray, film))
+        rewards.append(float(timestep.reward))
+        if timestep.terminated:
+            verdict = verdict_of(played.scenario, timestep.info)
+            break
+    units = jax.tree.map(lambda *leaves: np.concatenate(leaves), *films)
+    return Recording(units, np.cumsum(np.array(rewards, np.float64)), verdict)
+
+
+_film = jax.jit(step_and_film)
+
+
 @functools.partial(jax.jit, static_argnums=0)
 def _play_step(
     policy: Policy,

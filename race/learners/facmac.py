@@ -1,0 +1,291 @@
+"""FACMAC on discrete actions: recurrent policies, a factored critic, whole episodes.
+
+As in its paper and its configuration for SMAC (Peng et al. 2021, Appendix): one recurrent encoder
+and one head for all agents, centralised policy gradients through straight-through Gumbel-softmax
+samples of all agents' policies, utilities of all agents in one network, a monotonic mixer, and
+TD(lambda) targets at the target policies' best actions.
+
+Letters besides those of `race.types`: ``E`` episodes of a minibatch. Its samples are the steps of
+its episodes, time first: ``B = T * E``. Joint actions are one-hot, ``[B, N, A]``.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from race import critics, factored
+from race.config import Config
+from race.critics import StateValue
+from race.equations import mutual_information_signal
+from race.exploration import greedy, gumbel_softmax
+from race.factored import FactoredCritic, FactoredPevfa
+from race.learners.base import Learner, Samples
+from race.networks import Mine, init_one_head, init_one_mine
+from race.recurrent import GruEncoder, embed_episodes, init_gru_encoder
+from race.returns import lambda_returns
+from race.types import DiscreteSpec, Episode
+
+Head = Float[Array, "_ H1 A"]
+
+
+class Moments(NamedTuple):
+    """What the networks see of the moments of a minibatch's episodes."""
+
+    obs: Float[Array, "L E N O"]
+    last_action: Int[Array, "L E N"]  # -1 before the first step
+    avail_actions: Bool[Array, "L E N A"]
+    state: Float[Array, "L E S"]
+    real: Float[Array, "L E"]  # 0 behind the end of an episode
+
+
+def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> GruEncoder:
+    """A fresh encoder, one for all agents."""
+    size = config.facmac.hidden_size
+    return init_gru_encoder(key, spec.obs_size, spec.n_actions, spec.n_agents, size)
+
+
+def new_head(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Float[Array, "1 H1 A"]:
+    """A fresh head for all agents: the MARL team has but one (Appendix A.1)."""
+    return init_one_head(key, config.facmac.hidden_size, spec.n_actions)[None]
+
+
+def new_heads(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Float[Array, "N H1 A"]:
+    """Fresh heads of a team of the population, one per agent."""
+    keys = jax.random.split(key, spec.n_agents)
+    heads = [init_one_head(k, config.facmac.hidden_size, spec.n_actions) for k in keys]
+    return jnp.stack(heads)
+
+
+def new_critic(
+    key: PRNGKeyArray, spec: DiscreteSpec, config: Config, further_inputs: int = 0
+) -> FactoredCritic:
+    """Fresh utilities, one network for all agents, and a fresh mixer."""
+    utility_key, mixer_key = jax.random.split(key)
+    facmac = config.facmac
+    return FactoredCritic(
+        factored.init_utilities(
+            utility_key, spec.obs_size, spec.n_actions, facmac.utility_sizes, further_inputs
+        ),
+        factored.init_mixer(
+            mixer_key,
+            spec.state_size,
+            spec.n_agents,
+            facmac.mixer_size,
+            facmac.hypernet_size,
+            further_inputs,
+        ),
+    )
+
+
+def new_pevfa(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> FactoredPevfa:
+    """A fresh Critic PeVFA and Mixer PeVFA."""
+    critic_key, pevfa_key = jax.random.split(key)
+    size = config.race.policy_embedding_size
+    critic = new_critic(critic_key, spec, config, size)
+    return factored.init_pevfa(pevfa_key, critic, config.facmac.hidden_size + 1, size)
+
+
+def new_value(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> StateValue:
+    """A fresh state-value net."""
+    return critics.init_state_value(key, spec.state_size, (config.facmac.value_size,))
+
+
+def new_mine(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Mine:
+    """A fresh MINE network: one, because there is one encoder (Appendix A.1)."""
+    return init_one_mine(key, spec.state_size, config.facmac.hidden_size, config.race.mine_size)
+
+
+def moments(batch: Episode) -> Moments:
+    """All moments of a minibatch, time first, in float32."""
+    action = jnp.swapaxes(batch.action, 0, 1).astype(jnp.int32)
+    times = jnp.arange(action.shape[0] + 1, dtype=batch.length.dtype)
+    return Moments(
+        obs=jnp.swapaxes(batch.obs, 0, 1).astype(jnp.float32),
+        last_action=jnp.concatenate([jnp.full_like(action[:1], -1), action]),
+        avail_actions=jnp.swapaxes(batch.avail_actions, 0, 1),
+        state=jnp.swapaxes(batch.state, 0, 1).astype(jnp.float32),
+        real=(times[:, None] <= batch.length[None]).astype(jnp.float32),
+    )
+
+
+def now(batch: Episode, spec: DiscreteSpec) -> Samples:
+    """The steps that were made."""
+    before: Moments = jax.tree.map(lambda column: column[:-1], moments(batch))
+    real = (jnp.arange(before.real.shape[0])[:, None] < batch.length[None]).astype(jnp.float32)
+    taken = jnp.swapaxes(batch.action, 0, 1).reshape(-1, spec.n_agents)
+    action = jax.nn.one_hot(taken, spec.n_actions, dtype=jnp.float32)
+    return Samples(before._replace(real=real), action, real.reshape(-1))
+
+
+def later(batch: Episode, spec: DiscreteSpec) -> Moments:
+    """All moments, because the encoder remembers."""
+    return moments(batch)
+
+
+def encode(encoder: GruEncoder, moments: Moments, spec: DiscreteSpec) -> Float[Array, "L E N H"]:
+    """Embeddings of every agent at every moment."""
+    return embed_episodes(encoder, moments.obs, moments.last_action)
+
+
+def logits(z: Float[Array, "*b N H"], head: Head) -> Float[Array, "*b N A"]:
+    """``z W[1:d] + W[d+1]`` of every agent: through its own head, or the one of all."""
+    if head.shape[0] == 1:
+        product = z @ head[0, :-1]
+    else:
+        product = jnp.einsum("...nh,nha->...na", z, head[:, :-1])
+    return product + jnp.broadcast_to(head[:, -1], product.shape)
+
+
+def act(
+    z: Float[Array, "L E N H"],
+    head: Head,
+    moments: Moments,
+    key: PRNGKeyArray,
+    spec: DiscreteSpec,
+) -> Float[Array, "B N A"]:
+    """Samples of all agents' policies, with the gradient of a softmax."""
+    action = gumbel_softmax(logits(z, head), moments.avail_actions, key)
+    return action.reshape(-1, *action.shape[2:])
+
+
+def target_action(
+    z: Float[Array, "L E N H"],
+    head: Head,
+    moments: Moments,
+    key: PRNGKeyArray,
+    spec: DiscreteSpec,
+    config: Config,
+) -> Float[Array, "B N A"]:
+    """The policies' best actions."""
+    action = greedy(logits(z, head), moments.avail_actions)
+    return jax.nn.one_hot(action.reshape(-1, spec.n_agents), spec.n_actions, dtype=z.dtype)
+
+
+def _values(
+    critic: FactoredCritic,
+    moments: Moments,
+    action: Float[Array, "B N A"],
+    shifts: tuple[Array | None, Array | None] = (None, None),
+) -> Float[Array, "1 B"]:
+    samples, agents, actions = action.shape
+    obs = moments.obs.reshape(samples * agents, -1)
+    inputs = jnp.concatenate([obs, action.reshape(samples * agents, actions)], axis=1)
+    utilities = factored.utility_values(critic.utilities, inputs, shifts[0])
+    state = moments.state.reshape(samples, -1)
+    return factored.mix(critic.mixer, state, utilities.reshape(samples, agents), shifts[1])[None]
+
+
+def q_marl(
+    critic: FactoredCritic, moments: Moments, action: Float[Array, "B N A"], spec: DiscreteSpec
+) -> Float[Array, "1 B"]:
+    """``Q_psi(s, u)``."""
+    return _values(critic, moments, action)
+
+
+def q_team(
+    pevfa: FactoredPevfa,
+    moments: Moments,
+    action: Float[Array, "B N A"],
+    head: Float[Array, "N H1 A"],
+    spec: DiscreteSpec,
+) -> Float[Array, "1 B"]:
+    """``Q_theta(s, u, W)``."""
+    vectors = jnp.swapaxes(head, 1, 2).reshape(-1, head.shape[1])
+    return _values(pevfa.critic, moments, action, factored.embedding_shifts(pevfa, vectors))
+
+
+def only(values: Float[Array, "1 B"]) -> Float[Array, "B"]:
+    """There is one critic."""
+    return values[0]
+
+
+def td_target(batch: Episode, value: Float[Array, "moments"], config: Config) -> Float[Array, "B"]:
+    """TD(lambda) targets of every step; ``value`` holds those of all moments."""
+    facmac = config.facmac
+    reward, terminated = jnp.swapaxes(batch.reward, 0, 1), jnp.swapaxes(batch.terminated, 0, 1)
+    next_value = value.reshape(reward.shape[0] + 1, -1)[1:]
+    return lambda_returns(
+        reward, terminated, next_value, batch.length, facmac.discount, facmac.td_lambda
+    ).reshape(-1)
+
+
+def same(network: Any) -> Any:
+    """There is only one."""
+    return network
+
+
+def state_values(value: StateValue, moments: Moments) -> Float[Array, "B"]:
+    """``V_zeta(s)``."""
+    state = moments.state.reshape(-1, moments.state.shape[-1])
+    return critics.state_values(value, state, jax.nn.relu)
+
+
+def mutual_information(
+    mine: Mine, moments: Moments, z: Float[Array, "T E N H"], key: PRNGKeyArray
+) -> Float[Array, "1 B"]:
+    """Signals of every step, averaged over the agents that have something to choose.
+
+    The steps of a minibatch are thrown together and dealt out anew, E to a group; a step's
+    negatives are the same agent's embeddings at the other steps of its group. All pairs of a
+    minibatch would be a thousand times as many as its steps. An agent with one available action
+    (a dead one) has no part in it.
+    """
+    steps, episodes, agents, _ = z.shape
+    living = jnp.sum(moments.avail_actions, axis=-1) > 1
+    counted = living.astype(z.dtype) * moments.real[..., None]
+    deal = jax.random.permutation(key, steps * episodes)
+
+    def dealt(x: Array) -> Array:
+        flat = x.reshape(steps * episodes, *x.shape[2:])
+        return flat[deal].reshape(steps, episodes, *flat.shape[1:])
+
+    state, embedding, count = dealt(moments.state), dealt(z), dealt(counted)
+    x = jax.nn.leaky_relu(mine.state_hidden(state.reshape(steps * episodes, -1)))
+    x = jax.nn.leaky_relu(mine.state_out(x)).reshape(steps, episodes, -1)
+    y = mine.embedding(embedding.reshape(steps * episodes * agents, -1))
+    y = y.reshape(steps, episodes, agents, -1)
+    scores = jnp.einsum("gtm,gknm->gntk", x, y)
+    signal = jax.vmap(jax.vmap(mutual_information_signal, in_axes=(0, 1)))(scores, count)
+    total = jnp.sum(jnp.swapaxes(signal, 1, 2) * count, axis=2)
+    mean = total / jnp.maximum(jnp.sum(count, axis=2), 1.0)
+    return mean.reshape(-1)[jnp.argsort(deal)][None]
+
+
+def policy_due(step: Int[Array, ""], config: Config) -> bool:
+    """Policies are trained at every step."""
+    return True
+
+
+def follow(target: Any, online: Any, step: Int[Array, ""], config: Config) -> Any:
+    """Targets become copies of the networks after every so many gradient steps."""
+    due = (step + 1) % config.facmac.target_update_every == 0
+    return jax.tree.map(lambda t, o: jnp.where(due, o, t), target, online)
+
+
+facmac = Learner(
+    init_encoder=new_encoder,
+    init_head=new_head,
+    init_heads=new_heads,
+    init_critic=new_critic,
+    init_pevfa=new_pevfa,
+    init_value=new_value,
+    init_mine=new_mine,
+    now=now,
+    later=later,
+    encode=encode,
+    act=act,
+    target_action=target_action,
+    q_marl=q_marl,
+    q_team=q_team,
+    pessimistic=only,
+    td_target=td_target,
+    first_critic=same,
+    first_pevfa=same,
+    state_values=state_values,
+    mutual_information=mutual_information,
+    policy_due=policy_due,
+    follow=follow,
+)
+"""FACMAC, the paper's base method on discrete tasks."""

@@ -1,0 +1,32 @@
+"""Where a run's randomness comes from: its seed, a purpose, and a counter of the run."""
+
+from enum import IntEnum
+
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+from numpy.typing import NDArray
+
+from race.config import Config
+
+
+class Purpose(IntEnum):
+    """What randomness is for. Every use has its own stream, numbered by a counter of the run."""
+
+    INIT = 0
+    WARM_UP = 1
+    ROLLOUT = 2
+    EVOLUTION = 3
+    LEARNING = 4
+    EVALUATION = 5
+
+
+def root_key(config: Config, purpose: Purpose) -> PRNGKeyArray:
+    """The random key of one purpose."""
+    return jax.random.fold_in(jax.random.key(config.seed), int(purpose))
+
+
+def host_seeds(config: Config, purpose: Purpose, index: int, count: int) -> NDArray[np.int64]:
+    """Seeds for environments, from the run's seed, the purpose and a counter."""
+    sequence = np.random.SeedSequence((config.seed, int(purpose), index))
+    return sequence.generate_state(count).astype(np.int64)

@@ -1,0 +1,46 @@
+"""Lambda returns over whole episodes, the targets of recurrent learners."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+
+def lambda_returns(
+    reward: Float[Array, "T *b"],
+    terminated: Float[Array, "T *b"],
+    next_value: Float[Array, "T *b"],
+    length: Int[Array, "*b"],
+    discount: float,
+    td_lambda: float,
+) -> Float[Array, "T *b"]:
+    """TD(lambda) targets of every step of a batch of episodes (Sutton & Barto 2018, Section 12.1).
+
+    ``G_t = r_t + gamma (1 - terminated_t) ((1 - lambda) Q(s_{t+1}) + lambda G_{t+1})``, and at the
+    last step of an episode ``r_t + gamma (1 - terminated_t) Q(s_{t+1})``: an episode that was cut
+    off bootstraps from where it was cut.
+
+    Args:
+        reward: r_t.
+        terminated: 1 at a step that ended the task itself.
+        next_value: the target networks' ``Q(s_{t+1}, pi(s_{t+1}))``.
+        length: steps of each episode.
+        discount: gamma.
+        td_lambda: lambda.
+
+    Returns:
+        The targets; 0 behind the end of an episode, whatever stands there.
+    """
+
+    def back(
+        later: Float[Array, "*b"], step: tuple[Array, Array, Array, Array]
+    ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+        t, r, ended, value = step
+        mixed = jnp.where(t + 1 < length, (1.0 - td_lambda) * value + td_lambda * later, value)
+        # Where the task ended nothing follows, not even a NaN.
+        target = r + jnp.where(ended > 0, 0.0, discount * mixed)
+        target = jnp.where(t < length, target, 0.0)
+        return target, target
+
+    steps = jnp.arange(reward.shape[0], dtype=length.dtype)
+    first = jnp.zeros(reward.shape[1:], reward.dtype)
+    return jax.lax.scan(back, first, (steps, reward, terminated, next_value), reverse=True)[1]

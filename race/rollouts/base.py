@@ -1,0 +1,107 @@
+"""What training asks of rollouts, whatever kind of task they are of."""
+
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from numpy.typing import NDArray
+
+from race.algorithms.base import Teams
+from race.replay import Replay
+
+Steps = Callable[[int], None]
+"""Told how many environment steps have been made."""
+
+
+class Score(NamedTuple):
+    """Undiscounted returns of one team's test episodes."""
+
+    returns: NDArray[np.float64]  # [episodes]
+    lengths: NDArray[np.int64]  # [episodes]
+    won: Bool[np.ndarray, "episodes"] | None = None
+    """Which were won; None where a task cannot be won."""
+
+    @property
+    def mean(self) -> float:
+        """Mean return."""
+        return float(self.returns.mean())
+
+    @property
+    def std(self) -> float:
+        """Standard deviation of the returns over episodes."""
+        return float(self.returns.std())
+
+    @property
+    def win_rate(self) -> float | None:
+        """Share of the episodes that were won; None where a task cannot be won."""
+        return None if self.won is None else float(self.won.mean())
+
+
+class Generation(NamedTuple):
+    """What the episodes of one generation came to, one of each acting team."""
+
+    episode_return: NDArray[np.float64]  # [T]
+    env_steps: int
+
+
+@runtime_checkable
+class Rollouts(Protocol):
+    """A task's environments, played by teams. Use it in a ``with`` statement, or call `close`."""
+
+    def empty_replay(self) -> Replay:
+        """A buffer for what the rollouts bring, with room for all that a run needs."""
+        ...
+
+    def warm_up(
+        self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
+    ) -> tuple[Replay, int] | None:
+        """Random episodes before the first generation.
+
+        Returns:
+            The buffer and the steps made; None if it was interrupted.
+
+        Raises:
+            DivergenceError: if the environment gives a reward or a state that is not finite.
+        """
+        ...
+
+    def play(
+        self, teams: Teams, generation: int, env_steps: int, replay: Replay
+    ) -> tuple[Replay, Generation]:
+        """One episode of every team, all of whose steps go into the buffer.
+
+        Args:
+            teams: the population, then the MARL team, which alone explores.
+            generation: number of the generation, from 0.
+            env_steps: made before.
+            replay: the buffer.
+
+        Raises:
+            DivergenceError: if a reward, a state or an action is not a finite number.
+            TaskError: if an environment fails.
+        """
+        ...
+
+    def test(
+        self,
+        encoder: Any,
+        heads: Mapping[str, Float[Array, "N H1 A"]],
+        seeds: NDArray[np.int64],
+    ) -> dict[str, Score]:
+        """One episode per seed with each team, without exploration, all on the same seeds."""
+        ...
+
+    def close(self) -> None:
+        """Closes the environments."""
+        ...
+
+    def __enter__(self) -> "Rollouts": ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...

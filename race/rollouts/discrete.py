@@ -1,0 +1,154 @@
+"""Rollouts of tasks with discrete actions: whole episodes, on the device where that can be."""
+
+import math
+from collections.abc import Callable, Mapping
+from types import TracebackType
+from typing import Any, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import NDArray
+
+from race import programs
+from race.algorithms.base import Teams
+from race.config import Config
+from race.errors import DivergenceError
+from race.exploration import epsilon
+from race.randomness import Purpose, host_seeds, root_key
+from race.replay import Replay, init_replay
+from race.rollouts import device
+from race.rollouts.base import Generation, Score, Steps
+from race.rollouts.choosing import Exploration
+from race.rollouts.episodes import Played, empty_episode
+from race.rollouts.host_episodes import HostEnvs
+from race.types import DiscreteTask
+
+TESTS_AT_ONCE = 32
+"""Test episodes of a team in one program; a program serves one number of them only."""
+
+
+@final
+class EpisodeRollouts:
+    """A `race.rollouts.base.Rollouts`: on the device if the task can be played there."""
+
+    def __init__(self, config: Config, task: DiscreteTask, on_device: bool = True) -> None:
+        """Nothing is made yet.
+
+        Args:
+            config: the run's configuration.
+            task: the task.
+            on_device: whether to play on the device if the task can be played there.
+        """
+        self._config, self._spec = config, task.spec
+        self._env = task.device() if on_device and task.device is not None else None
+        self._host = HostEnvs(task)
+
+    def empty_replay(self) -> Replay:
+        """A short run does not pay for a long one's memory: an episode has at least one step."""
+        facmac = self._config.facmac
+        most = max(self._config.env_steps + self._config.n_teams, facmac.batch_size)
+        item = empty_episode(self._spec, facmac.replay_precision)
+        return init_replay(item, min(facmac.replay_capacity, most))
+
+    def warm_up(
+        self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
+    ) -> tuple[Replay, int] | None:
+        """There is none: exploration begins with many random actions."""
+        return replay, 0
+
+    def play(
+        self, teams: Teams, generation: int, env_steps: int, replay: Replay
+    ) -> tuple[Replay, Generation]:
+        """The MARL team chooses at random now and then; the population explores by diversity."""
+        config, facmac = self._config, self._config.facmac
+        share = epsilon(
+            env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
+        )
+        how = Exploration(
+            jnp.arange(config.n_teams) == config.n_teams - 1,
+            jnp.float32(share),
+            jax.random.fold_in(root_key(config, Purpose.ROLLOUT), generation),
+        )
+        seeds = host_seeds(config, Purpose.ROLLOUT, generation, config.n_teams)
+        played = self._play(teams, seeds, how)
+        self._check_finite(played, f"generation {generation + 1}")
+        replay = programs.store(replay, played.episodes, np.int32(config.n_teams))
+        returns = np.asarray(played.episode_return, np.float64)
+        return replay, Generation(returns, int(np.sum(played.episodes.length)))
+
+    def test(
+        self,
+        encoder: Any,
+        heads: Mapping[str, Float[Array, "N H1 A"]],
+        seeds: NDArray[np.int64],
+    ) -> dict[str, Score]:
+        """At most `TESTS_AT_ONCE` episodes of each team at once."""
+        names, n = list(heads), len(seeds)
+        size = min(n, TESTS_AT_ONCE)
+        teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), size, axis=0))
+        parts = []
+        for first in range(0, n, size):
+            piece = seeds[first : first + size]
+            filled = np.concatenate([piece, seeds[: size - len(piece)]])
+            played = self._play(teams, np.tile(filled, len(names)), None)
+            results = (played.episode_return, played.episodes.length, played.won)
+            shape = (len(names), size)
+            parts.append([np.asarray(r).reshape(shape)[:, : len(piece)] for r in results])
+        returns, lengths, won = (
+            np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)
+        )
+        return {
+            name: Score(
+                returns[i].astype(np.float64),
+                lengths[i].astype(np.int64),
+                won[i] if self._spec.has_wins else None,
+            )
+            for i, name in enumerate(names)
+        }
+
+    def episode(self, encoder: Any, head: Float[Array, "N H1 A"], seed: int) -> NDArray[np.int32]:
+        """The actions of one episode of a team without exploration, [steps, N]."""
+        played = self._play(Teams(encoder, head[None]), np.array([seed]), None)
+        steps = int(played.episodes.length[0])
+        return np.asarray(played.episodes.action[0, :steps]).astype(np.int32)
+
+    def close(self) -> None:
+        """Closes the environments on the host."""
+        self._host.close()
+
+    def __enter__(self) -> "EpisodeRollouts":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _play(self, teams: Teams, seeds: NDArray[np.int64], how: Exploration | None) -> Played:
+        small = (seeds % 2**31).astype(np.uint32)
+        precision = self._config.facmac.replay_precision
+        if self._env is None:
+            return self._host.play(teams, small, how, precision)
+        return device.play(self._env, teams, small, how, self._spec, precision)
+
+    def _check_finite(self, played: Played, where: str) -> None:
+        returns = np.asarray(played.episode_return).tolist()
+        for team, value in enumerate(returns):
+            if not math.isfinite(value):
+                raise DivergenceError(
+                    f"The return of team {team} in {where} is {value}: the environment gave a "
+                    "reward that is not a finite number. A fitness like that never wins, and a "
+                    "buffer that holds it teaches nothing, so the run stops here. Look at the "
+                    "task's reward."
+                )
+        if not programs.all_finite((played.episodes.obs, played.episodes.state)):
+            raise DivergenceError(
+                f"The environment gave an observation or a state in {where} that is not a finite "
+                "number, or is too large for the replay buffer, which keeps numbers up to 65504 "
+                "with --facmac.replay-precision float16 and all with float32."
+            )

@@ -1,0 +1,141 @@
+"""Episodes of tasks with discrete actions on the host, such as the real StarcraftII."""
+
+import traceback
+from functools import partial
+from types import TracebackType
+from typing import Any, final
+
+import gymnasium
+import jax
+import numpy as np
+from numpy.typing import NDArray
+
+from race.algorithms.base import Teams
+from race.errors import TaskError
+from race.rollouts.choosing import Exploration, blank, choose
+from race.rollouts.episodes import Played, empty_episode
+from race.types import DiscreteTask, Observation
+
+_choose = jax.jit(choose)
+_blank = jax.jit(blank)
+
+
+@final
+class HostEnvs:
+    """Environments of one task on the host, stepped one after the other.
+
+    Use it in a ``with`` statement, or call `close`. They are made when they are needed.
+
+    Attributes:
+        task: the task.
+    """
+
+    def __init__(self, task: DiscreteTask) -> None:
+        self.task = task
+        self._envs: list[gymnasium.Env[Any, Any]] = []
+
+    def play(
+        self, teams: Teams, seeds: NDArray[np.uint32], how: Exploration | None, precision: str
+    ) -> Played:
+        """One episode per team; see `race.rollouts.device.play`, which does the same.
+
+        Args:
+            teams: the teams.
+            seeds: of the environments' resets.
+            how: who explores; None for nobody.
+            precision: dtype of the observations and states of the episodes.
+
+        Returns:
+            As numpy arrays.
+
+        Raises:
+            TaskError: if an environment fails or shows something of another shape.
+        """
+        spec, count = self.task.spec, len(seeds)
+        while len(self._envs) < count:
+            self._envs.append(self.task.make(None))
+        episodes = empty_episode(spec, precision, count)
+        returns, won = np.zeros(count, np.float32), np.zeros(count, bool)
+        seen = Observation(
+            np.zeros((count, spec.n_agents, spec.obs_size), np.float32),
+            np.zeros((count, spec.state_size), np.float32),
+            np.zeros((count, spec.n_agents, spec.n_actions), bool),
+        )
+        running = list(range(count))
+        for team in running:
+            self._see(seen, team, partial(self._reset, int(seeds[team])))
+            _write(episodes, seen, team, 0)
+        memory = _blank(teams)
+        for tick in range(spec.episode_limit):
+            if not running:
+                break
+            # A copy, because JAX may still read an array that it was given.
+            shown = jax.tree.map(np.copy, seen)
+            memory, chosen = _choose(teams, memory, shown, np.int32(tick), how)
+            actions = np.asarray(chosen)
+            for team in tuple(running):
+                reward, terminated, truncated, info = self._see(
+                    seen, team, partial(self._step, actions[team])
+                )
+                episodes.action[team, tick] = actions[team]
+                episodes.reward[team, tick] = reward
+                episodes.terminated[team, tick] = terminated
+                episodes.length[team] = tick + 1
+                _write(episodes, seen, team, tick + 1)
+                returns[team] += np.float32(reward)
+                won[team] |= bool(info.get("battle_won", False))
+                if terminated or truncated:
+                    running.remove(team)
+        return Played(episodes, returns, won)
+
+    def close(self) -> None:
+        """Closes the environments."""
+        envs, self._envs = self._envs, []
+        for env in envs:
+            env.close()
+
+    def __enter__(self) -> "HostEnvs":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @staticmethod
+    def _reset(seed: int, env: gymnasium.Env[Any, Any]) -> tuple[Any, Any]:
+        return env.reset(seed=seed)[0], None
+
+    @staticmethod
+    def _step(action: NDArray[np.int32], env: gymnasium.Env[Any, Any]) -> tuple[Any, Any]:
+        observation, reward, terminated, truncated, info = env.step(action)
+        return observation, (float(reward), bool(terminated), bool(truncated), info)
+
+    def _see(self, seen: Observation, team: int, move: Any) -> Any:
+        """Makes a move in a team's environment and writes down what it shows."""
+        try:
+            observation, outcome = move(self._envs[team])
+            for name, column in seen._asdict().items():
+                value = np.asarray(observation[name])
+                if value.shape != column.shape[1:]:
+                    raise ValueError(
+                        f"its {name} has the shape {value.shape} instead of {column.shape[1:]}"
+                    )
+                column[team] = value
+        except Exception as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+            raise TaskError(
+                f"The environment of {self.task.spec.task} failed (environment {team}): "
+                f"{type(error).__name__}: {error}{place}."
+            ) from error
+        return outcome
+
+
+def _write(episodes: Any, seen: Observation, team: int, place: int) -> None:
+    episodes.obs[team, place] = seen.obs[team]
+    episodes.state[team, place] = seen.state[team]
+    episodes.avail_actions[team, place] = seen.avail_actions[team]
