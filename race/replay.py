@@ -71,8 +71,8 @@ def episodes_at(replay: Replay, places: Int[Array, "B"], steps: int) -> Episode:
             start = (place, *[zero] * (column.ndim - 1))
             return jax.lax.dynamic_slice(column, start, (1, *size))[0]
 
-        # Each episode is one contiguous piece: a gather would copy it entry by entry.
-        return jax.lax.map(one, places)
+        # Not in a loop, which would copy the whole column into its state.
+        return jax.vmap(one)(places)
 
     return Episode(
         obs=cut(data.obs, steps + 1),
