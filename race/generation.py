@@ -9,13 +9,16 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PRNGKeyArray
 
 from race import programs
 from race.algorithms.base import tested_teams
 from race.clock import Clock
 from race.errors import DivergenceError
+from race.packing import layouts
 from race.randomness import Purpose, host_seeds, root_key
 from race.records import evaluation_row, generation_row
+from race.replay import Layout
 from race.run import Run, save
 from race.run_state import RunState
 
@@ -23,8 +26,6 @@ CHUNK = 100
 """Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
 EPISODES_CHUNK = 12
 """The same where each is made on whole episodes and takes far longer."""
-CUTS = 8
-"""Numbers of steps to which minibatches of episodes are cut."""
 
 
 def warm_up(run: Run, state: RunState) -> RunState:
@@ -123,19 +124,20 @@ def learn(run: Run, state: RunState) -> RunState:
     """
     progress = state.progress
     key, first = root_key(run.config, Purpose.LEARNING), np.int32(progress.gradient_steps)
-    statics = run.statics
+    count, laid = min(CHUNK, _owed(run, state)), None
     if run.config.discrete:
-        # Minibatches of episodes differ in length, and with it the program. Where a generation's
-        # steps are parted depends on nothing else, so that a resumed run parts them alike.
-        count = min(EPISODES_CHUNK, _owed(run, state))
-        longest = programs.longest(
-            state.replay, key, first, np.int32(count), config=statics["config"]
-        )
-        statics["steps"] = cut(int(longest), run.task.spec.episode_limit)
-    else:
-        count = min(CHUNK, _owed(run, state))
+        # Where a generation's steps are parted depends on nothing but their number, so that a
+        # resumed run parts them alike.
+        count, laid = _minibatches(run, state, key)
     algorithm, losses = programs.learn(
-        state.algorithm, state.losses, state.replay, key, first, np.int32(count), **statics
+        state.algorithm,
+        state.losses,
+        state.replay,
+        key,
+        first,
+        np.int32(count),
+        **run.statics,
+        layouts=laid,
     )
     for name, value in losses.items():
         if not math.isfinite(float(value)):
@@ -154,15 +156,17 @@ def learn(run: Run, state: RunState) -> RunState:
     return state._replace(algorithm=algorithm, losses=losses, progress=progress)
 
 
-def cut(longest: int, limit: int) -> int:
-    """Steps to which a minibatch of episodes is cut: few different numbers, each a program.
-
-    Args:
-        longest: steps of its longest episode.
-        limit: the task's.
-    """
-    unit = math.ceil(limit / CUTS)
-    return min(math.ceil(max(longest, 1) / unit) * unit, limit)
+def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Layout]:
+    """The next gradient steps on episodes: how many, and how their minibatches are laid out."""
+    config, room = run.config, max(EPISODES_CHUNK, run.config.n_teams)
+    count = min(room, _owed(run, state))
+    first = np.int32(state.progress.gradient_steps)
+    shared = run.statics["config"]
+    # Always as many as a generation usually has: each number would be a program of its own.
+    room = config.n_teams if count <= config.n_teams else room
+    drawn = programs.draw(state.replay, key, first, count=room, config=shared)
+    places, lengths = (np.asarray(column)[:count] for column in drawn)
+    return count, layouts(places, lengths, run.task.spec.episode_limit, room)
 
 
 def _owed(run: Run, state: RunState) -> int:

@@ -46,40 +46,45 @@ def _gates(weight: Gates, bias: Gates, carry: Array, inputs: Gates) -> tuple[Arr
 
 
 @jax.custom_vjp
-def gru(weight: Gates, bias: Gates, inputs: Gates) -> Float[Array, "L R H"]:
-    """All states ``h_1 ... h_L`` of sequences that begin with ``h_0 = 0``.
+def gru(
+    weight: Gates, bias: Gates, inputs: Gates, keep: Float[Array, "L R"]
+) -> Float[Array, "L R H"]:
+    """All states ``h_1 ... h_L`` of sequences, with ``h_0 = 0``.
 
     Args:
         weight: U, [H, H] each.
         bias: b, [H] each.
         inputs: a, [L, R, H] each.
+        keep: 0 at a step that begins a sequence anew, from a state of 0; 1 elsewhere. It gets no
+            gradient.
     """
 
-    def step(carry: Array, inputs: Gates) -> tuple[Array, Array]:
-        after = gru_step(weight, bias, carry, inputs)
+    def step(carry: Array, now: tuple[Gates, Array]) -> tuple[Array, Array]:
+        inputs, keep = now
+        after = gru_step(weight, bias, carry * keep[:, None], inputs)
         return after, after
 
     begin = jnp.zeros(inputs.reset.shape[1:], inputs.reset.dtype)
-    return jax.lax.scan(step, begin, inputs)[1]
+    return jax.lax.scan(step, begin, (inputs, keep))[1]
 
 
-_Saved = tuple[Gates, Gates, Gates, Array]
+_Saved = tuple[Gates, Gates, Gates, Array, Array]
 
 
-def _forwards(weight: Gates, bias: Gates, inputs: Gates) -> tuple[Array, _Saved]:
-    after = gru(weight, bias, inputs)
-    return after, (weight, bias, inputs, after)
+def _forwards(weight: Gates, bias: Gates, inputs: Gates, keep: Array) -> tuple[Array, _Saved]:
+    after = gru(weight, bias, inputs, keep)
+    return after, (weight, bias, inputs, keep, after)
 
 
-def _backwards(saved: _Saved, cotangent: Array) -> tuple[Gates, Gates, Gates]:
+def _backwards(saved: _Saved, cotangent: Array) -> tuple[Gates, Gates, Gates, Array]:
     """What is not recurrent is computed for all steps at once.
 
     The loop carries the gradient of the state alone; gates are computed anew, which is faster than
     to store them in the loop, and gradients of weights are one product after it.
     """
-    weight, bias, inputs, after = saved
+    weight, bias, inputs, keep, after = saved
     size = after.shape[-1]
-    before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]])
+    before = jnp.concatenate([jnp.zeros_like(after[:1]), after[:-1]]) * keep[..., None]
     rows = before.reshape(-1, size)
     flat = Gates(*(a.reshape(-1, size) for a in inputs))
     r, u, c, own = _gates(weight, bias, rows, flat)
@@ -93,19 +98,21 @@ def _backwards(saved: _Saved, cotangent: Array) -> tuple[Gates, Gates, Gates]:
     transposed = jax.lax.optimization_barrier(Gates(*(w.T for w in weight)))
 
     def step(ahead: Array, now: tuple[Array, ...]) -> tuple[Array, Array]:
-        direct, reset, update, candidate, keep = now
+        direct, reset, update, candidate, through, keep = now
         total = ahead + direct
         back = (total * reset) @ transposed.reset + (total * update) @ transposed.update
-        return back + (total * candidate) @ transposed.candidate + total * keep, total
+        back = back + (total * candidate) @ transposed.candidate + total * through
+        return back * keep[:, None], total
 
     begin = jnp.zeros_like(after[0])
-    total = jax.lax.scan(step, begin, (cotangent, *slopes_by_step, u), reverse=True)[1]
+    total = jax.lax.scan(step, begin, (cotangent, *slopes_by_step, u, keep), reverse=True)[1]
     moved = Gates(*jax.lax.optimization_barrier(tuple(total * s for s in slopes_by_step)))
     by_row = Gates(*(m.reshape(-1, size) for m in moved))
     return (
         Gates(*(rows.T @ m for m in by_row)),
         Gates(*(jnp.sum(m, axis=0) for m in by_row)),
         Gates(moved.reset, moved.update, total * to_candidate),
+        jnp.zeros_like(keep),
     )
 
 

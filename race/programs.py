@@ -14,7 +14,7 @@ from race.algorithms.base import Losses, Teams
 from race.config import Config
 from race.learners import LEARNERS
 from race.networks import act_teams
-from race.replay import Replay, distinct_places, episodes_at, insert, sample
+from race.replay import Layout, Replay, distinct_places, insert, sample, slots_of
 from race.types import EnvSpec, Spec
 
 TRACES: Counter[str] = Counter()
@@ -32,7 +32,7 @@ def empty_losses(algorithm: Algorithm) -> Losses:
 
 @partial(
     jax.jit,
-    static_argnames=("algorithm", "spec", "config", "steps"),
+    static_argnames=("algorithm", "spec", "config"),
     donate_argnames=("state", "sums"),
 )
 def learn(
@@ -46,12 +46,12 @@ def learn(
     algorithm: Algorithm,
     spec: Spec,
     config: Config,
-    steps: int = 0,
+    layouts: Layout | None = None,
 ) -> tuple[Any, Losses]:
     """Gradient steps ``first_step`` to ``first_step + n_steps - 1`` of a run, in one program.
 
     The randomness of a step depends on ``key`` and the step's number alone, so that steps may be
-    split over calls in any way. Minibatches of episodes are cut to ``steps`` steps.
+    split over calls in any way. Minibatches of episodes are those of the ``layouts``, one a step.
 
     Returns:
         The state and ``sums`` with the steps' losses added.
@@ -62,11 +62,10 @@ def learn(
         state, sums = carry
         step = first_step + i
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, step))
-        if config.discrete:
-            places = distinct_places(replay, config.facmac.batch_size, sample_key)
-            batch = episodes_at(replay, places, steps)
-        else:
+        if layouts is None:
             batch = sample(replay, config.learner.batch_size, sample_key)
+        else:
+            batch = slots_of(replay, jax.tree.map(lambda column: column[i], layouts))
         state, critic, policy = algorithm.update(state, batch, step, update_key, spec, config)
         losses = critic | policy
         return state, {name: sums[name] + losses[name] for name in sums}
@@ -74,24 +73,19 @@ def learn(
     return jax.lax.fori_loop(0, n_steps, body, (state, sums))
 
 
-@partial(jax.jit, static_argnames="config")
-def longest(
-    replay: Replay,
-    key: PRNGKeyArray,
-    first_step: Int[Array, ""],
-    n_steps: Int[Array, ""],
-    *,
-    config: Config,
-) -> Int[Array, ""]:
-    """Steps of the longest episode that `learn` will draw for some gradient steps."""
-    TRACES["longest"] += 1
+@partial(jax.jit, static_argnames=("count", "config"))
+def draw(
+    replay: Replay, key: PRNGKeyArray, first_step: Int[Array, ""], *, count: int, config: Config
+) -> tuple[Int[Array, "count B"], Int[Array, "count B"]]:
+    """The minibatches of episodes of some gradient steps: their places and their lengths."""
+    TRACES["draw"] += 1
 
-    def body(i: Int[Array, ""], found: Int[Array, ""]) -> Int[Array, ""]:
+    def one(i: Int[Array, ""]) -> Int[Array, "B"]:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        places = distinct_places(replay, config.facmac.batch_size, sample_key)
-        return jnp.maximum(found, jnp.max(replay.data.length[places]))
+        return distinct_places(replay, config.facmac.batch_size, sample_key)
 
-    return jax.lax.fori_loop(0, n_steps, body, jnp.zeros((), jnp.int32))
+    places = jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
+    return places, replay.data.length[places]
 
 
 @partial(jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames="state")

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.gru import Gates, gru, gru_step
 from race.networks import Dense, init_dense
@@ -97,10 +97,14 @@ def embed_step(
 
 
 def embed_episodes(
-    encoder: GruEncoder, obs: Float[Array, "L B N O"], last_action: Int[Array, "L B N"]
-) -> Float[Array, "L B N H"]:
-    """Embeddings of every moment of whole episodes."""
+    encoder: GruEncoder,
+    obs: Float[Array, "L R N O"],
+    last_action: Int[Array, "L R N"],
+    first: Bool[Array, "L R"],
+) -> Float[Array, "L R N H"]:
+    """Embeddings of every moment of whole episodes; the memory is blank at each ``first``."""
     inputs = gate_inputs(encoder, obs, last_action)
-    moments, batch, agents, size = inputs.reset.shape
-    rows = Gates(*(a.reshape(moments, batch * agents, size) for a in inputs))
-    return gru(*_gates(encoder.recurrent), rows).reshape(moments, batch, agents, size)
+    moments, rows, agents, size = inputs.reset.shape
+    flat = Gates(*(a.reshape(moments, rows * agents, size) for a in inputs))
+    keep = jnp.repeat(1.0 - first.astype(obs.dtype), agents, axis=1)
+    return gru(*_gates(encoder.recurrent), flat, keep).reshape(moments, rows, agents, size)

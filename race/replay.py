@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from race.types import Episode
+from race.types import Episode, Slots
 
 
 class Replay(NamedTuple):
@@ -59,29 +59,37 @@ def distinct_places(replay: Replay, batch_size: int, key: PRNGKeyArray) -> Int[A
     return jax.lax.top_k(jnp.where(taken, lots, -1.0), batch_size)[1].astype(jnp.int32)
 
 
-def episodes_at(replay: Replay, places: Int[Array, "B"], steps: int) -> Episode:
-    """The first ``steps`` steps of some episodes, none of which is longer."""
+class Layout(NamedTuple):
+    """Which moment of which episode lies where in the slots of a minibatch (`race.packing`)."""
+
+    place: Int[Any, "L R"]  # of the episode in the buffer; 0 in empty slots
+    time: Int[Any, "L R"]  # of the moment in its episode; -1 in empty slots
+
+
+def slots_of(replay: Replay, layout: Layout) -> Slots:
+    """The minibatch of a layout. Empty slots hold zeros."""
     data: Episode = replay.data
+    real, time = layout.time >= 0, jnp.maximum(layout.time, 0)
+    acted = real & (time < data.length[layout.place])
+    before = jnp.maximum(time - 1, 0)
+    made = jnp.minimum(time, data.reward.shape[1] - 1)  # no step follows the last moment
 
-    def cut(column: Array, moments: int) -> Array:
-        size = (moments, *column.shape[2:])
+    def at(column: Array, time: Array, there: Array) -> Array:
+        found = column[layout.place, time]
+        return jnp.where(there.reshape(*there.shape, *[1] * (found.ndim - 2)), found, 0)
 
-        def one(place: Int[Array, ""]) -> Array:
-            zero = jnp.zeros_like(place)
-            start = (place, *[zero] * (column.ndim - 1))
-            return jax.lax.dynamic_slice(column, start, (1, *size))[0]
-
-        # Not in a loop, which would copy the whole column into its state.
-        return jax.vmap(one)(places)
-
-    return Episode(
-        obs=cut(data.obs, steps + 1),
-        state=cut(data.state, steps + 1),
-        avail_actions=cut(data.avail_actions, steps + 1),
-        action=cut(data.action, steps),
-        reward=cut(data.reward, steps),
-        terminated=cut(data.terminated, steps),
-        length=data.length[places],
+    last_action = data.action[layout.place, before].astype(jnp.int32)
+    return Slots(
+        obs=at(data.obs, time, real),
+        state=at(data.state, time, real),
+        avail_actions=at(data.avail_actions, time, real).astype(bool),
+        action=at(data.action, made, acted),
+        last_action=jnp.where((layout.time > 0)[..., None], last_action, -1),
+        reward=at(data.reward, made, acted),
+        terminated=at(data.terminated, made, acted),
+        first=layout.time == 0,
+        acted=acted,
+        real=real,
     )
 
 

@@ -2,14 +2,14 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float
 
 
 def lambda_returns(
     reward: Float[Array, "T *b"],
     terminated: Float[Array, "T *b"],
     next_value: Float[Array, "T *b"],
-    length: Int[Array, "*b"],
+    acted: Bool[Array, "T *b"],
     discount: float,
     td_lambda: float,
 ) -> Float[Array, "T *b"]:
@@ -23,24 +23,25 @@ def lambda_returns(
         reward: r_t.
         terminated: 1 at a step that ended the task itself.
         next_value: the target networks' ``Q(s_{t+1}, pi(s_{t+1}))``.
-        length: steps of each episode.
+        acted: where steps were made; an episode ends where the next place has none.
         discount: gamma.
         td_lambda: lambda.
 
     Returns:
-        The targets; 0 behind the end of an episode, whatever stands there.
+        The targets; 0 where no step was made, whatever stands there.
     """
 
     def back(
-        later: Float[Array, "*b"], step: tuple[Array, Array, Array, Array]
-    ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-        t, r, ended, value = step
-        mixed = jnp.where(t + 1 < length, (1.0 - td_lambda) * value + td_lambda * later, value)
+        ahead: tuple[Array, Array], step: tuple[Array, Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], Float[Array, "*b"]]:
+        later, goes_on = ahead
+        r, ended, value, made = step
+        mixed = jnp.where(goes_on, (1.0 - td_lambda) * value + td_lambda * later, value)
         # Where the task ended nothing follows, not even a NaN.
         target = r + jnp.where(ended > 0, 0.0, discount * mixed)
-        target = jnp.where(t < length, target, 0.0)
-        return target, target
+        target = jnp.where(made, target, 0.0)
+        return (target, made), target
 
-    steps = jnp.arange(reward.shape[0], dtype=length.dtype)
-    first = jnp.zeros(reward.shape[1:], reward.dtype)
-    return jax.lax.scan(back, first, (steps, reward, terminated, next_value), reverse=True)[1]
+    nothing = jnp.zeros(reward.shape[1:], reward.dtype), jnp.zeros(reward.shape[1:], bool)
+    steps = (reward, terminated, next_value, acted)
+    return jax.lax.scan(back, nothing, steps, reverse=True)[1]

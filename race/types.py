@@ -16,6 +16,7 @@ letter      axis
 ``T``       teams that act: the population, then the MARL team
 ``K``       critics of an ensemble (2 for MATD3, 1 for MADDPG and FACMAC)
 ``L``       moments of an episode: before each of its steps, and after the last
+``R``       rows of a minibatch of episodes, each of one or more of them
 ==========  =====================================================================
 """
 
@@ -71,6 +72,26 @@ class Episode(NamedTuple):
     reward: Float[Any, "*b L-1"]
     terminated: Float[Any, "*b L-1"]
     length: Int[Any, "*b"]
+
+
+class Slots(NamedTuple):
+    """Episodes of unequal lengths laid end to end in ``R`` rows of ``L`` slots, time first.
+
+    A slot holds a moment of an episode or nothing. Each episode lies in one row with all its
+    moments, that after its last step included, so that the slot behind a step is the moment it led
+    to; a row begins with an episode's first moment or with nothing.
+    """
+
+    obs: Float[Any, "L R N O"]
+    state: Float[Any, "L R S"]
+    avail_actions: Bool[Any, "L R N A"]
+    action: Int[Any, "L R N"]
+    last_action: Int[Any, "L R N"]  # of the step that led here; -1 at an episode's first moment
+    reward: Float[Any, "L R"]
+    terminated: Float[Any, "L R"]
+    first: Bool[Any, "L R"]  # an episode begins here
+    acted: Bool[Any, "L R"]  # a step was made here
+    real: Bool[Any, "L R"]  # there is something here
 
 
 class Rollout(NamedTuple):

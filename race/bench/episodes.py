@@ -17,7 +17,7 @@ from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best
 from race.config import Algo, Config
 from race.presets import resolve
-from race.replay import Replay
+from race.replay import Layout, Replay
 from race.rollouts.episodes import empty_episode
 from race.run_state import Progress
 from race.trainer import train
@@ -73,13 +73,17 @@ def random_episodes(spec: DiscreteSpec, count: int, precision: str) -> Episode:
 class EpisodeUpdates:
     """Runs gradient steps of a fresh learner on some episodes, as training runs them.
 
-    Minibatches are not cut: all are as long as the spec's limit.
+    Minibatches are as large as can be: every episode has a row of its own.
     """
 
     def __init__(self, config: Config, spec: DiscreteSpec, episodes: Episode) -> None:
         algorithm = algorithm_of(config)
         self._statics = {"algorithm": algorithm, "spec": spec, "config": config}
-        self._steps = spec.episode_limit
+        rows = config.facmac.batch_size
+        place = np.broadcast_to(np.arange(rows, dtype=np.int32), (spec.episode_limit + 1, rows))
+        time = np.arange(spec.episode_limit + 1, dtype=np.int32)[:, None]
+        time = np.where(time <= episodes.length[:rows], time, np.int32(-1))
+        self._layout = Layout(*(np.repeat(c[None], STEPS, axis=0) for c in (place, time)))
         data = Episode(*map(jnp.asarray, episodes))
         self.replay = Replay(data, jnp.asarray(len(episodes.length), jnp.int32))
         fresh = programs.start(jax.random.key(0), **self._statics)
@@ -87,7 +91,7 @@ class EpisodeUpdates:
         self._sums = programs.empty_losses(algorithm)
 
     def __call__(self, steps: int) -> Any:
-        """Makes a number of gradient steps."""
+        """Makes a number of gradient steps, up to `STEPS`."""
         self._state, self._sums = programs.learn(
             self._state,
             self._sums,
@@ -96,7 +100,7 @@ class EpisodeUpdates:
             np.int32(0),
             np.int32(steps),
             **self._statics,
-            steps=self._steps,
+            layouts=self._layout,
         )
         return self._state
 

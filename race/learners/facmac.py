@@ -5,8 +5,8 @@ and one head for all agents, centralised policy gradients through straight-throu
 samples of all agents' policies, utilities of all agents in one network, a monotonic mixer, and
 TD(lambda) targets at the target policies' best actions.
 
-Letters besides those of `race.types`: ``E`` episodes of a minibatch. Its samples are the steps of
-its episodes, time first: ``B = T * E``. Joint actions are one-hot, ``[B, N, A]``.
+A minibatch of episodes comes as `Slots`; its samples are all slots but the last of each row, time
+first: ``B = (L - 1) * R``. Joint actions are one-hot, ``[B, N, A]``.
 """
 
 from typing import Any, NamedTuple
@@ -25,19 +25,23 @@ from race.learners.base import Learner, Samples
 from race.networks import Mine, init_one_head, init_one_mine
 from race.recurrent import GruEncoder, embed_episodes, init_gru_encoder
 from race.returns import lambda_returns
-from race.types import DiscreteSpec, Episode
+from race.types import DiscreteSpec, Slots
+
+GROUP = 32
+"""Steps among which MINE's pairs are made."""
 
 Head = Float[Array, "_ H1 A"]
 
 
 class Moments(NamedTuple):
-    """What the networks see of the moments of a minibatch's episodes."""
+    """What the networks see of the slots of a minibatch."""
 
-    obs: Float[Array, "L E N O"]
-    last_action: Int[Array, "L E N"]  # -1 before the first step
-    avail_actions: Bool[Array, "L E N A"]
-    state: Float[Array, "L E S"]
-    real: Float[Array, "L E"]  # 0 behind the end of an episode
+    obs: Float[Array, "L R N O"]
+    last_action: Int[Array, "L R N"]  # -1 before the first step
+    avail_actions: Bool[Array, "L R N A"]
+    state: Float[Array, "L R S"]
+    first: Bool[Array, "L R"]  # an episode begins here
+    real: Float[Array, "L R"]  # 0 where no step was made, or in `later` where there is no moment
 
 
 def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> GruEncoder:
@@ -97,36 +101,34 @@ def new_mine(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Mine:
     return init_one_mine(key, spec.state_size, config.facmac.hidden_size, config.race.mine_size)
 
 
-def moments(batch: Episode) -> Moments:
-    """All moments of a minibatch, time first, in float32."""
-    action = jnp.swapaxes(batch.action, 0, 1).astype(jnp.int32)
-    times = jnp.arange(action.shape[0] + 1, dtype=batch.length.dtype)
+def now(batch: Slots, spec: DiscreteSpec) -> Samples:
+    """The slots of steps: all but the last, in which no step can be."""
+    before: Slots = jax.tree.map(lambda column: column[:-1], batch)
+    real = before.acted.astype(jnp.float32)
+    taken = before.action.reshape(-1, spec.n_agents).astype(jnp.int32)
+    action = jax.nn.one_hot(taken, spec.n_actions, dtype=jnp.float32)
+    return Samples(_moments(before, real), action, real.reshape(-1))
+
+
+def later(batch: Slots, spec: DiscreteSpec) -> Moments:
+    """All slots, because the encoder remembers."""
+    return _moments(batch, batch.real.astype(jnp.float32))
+
+
+def _moments(slots: Slots, real: Float[Array, "L R"]) -> Moments:
     return Moments(
-        obs=jnp.swapaxes(batch.obs, 0, 1).astype(jnp.float32),
-        last_action=jnp.concatenate([jnp.full_like(action[:1], -1), action]),
-        avail_actions=jnp.swapaxes(batch.avail_actions, 0, 1),
-        state=jnp.swapaxes(batch.state, 0, 1).astype(jnp.float32),
-        real=(times[:, None] <= batch.length[None]).astype(jnp.float32),
+        obs=slots.obs.astype(jnp.float32),
+        last_action=slots.last_action,
+        avail_actions=slots.avail_actions,
+        state=slots.state.astype(jnp.float32),
+        first=slots.first,
+        real=real,
     )
 
 
-def now(batch: Episode, spec: DiscreteSpec) -> Samples:
-    """The steps that were made."""
-    before: Moments = jax.tree.map(lambda column: column[:-1], moments(batch))
-    real = (jnp.arange(before.real.shape[0])[:, None] < batch.length[None]).astype(jnp.float32)
-    taken = jnp.swapaxes(batch.action, 0, 1).reshape(-1, spec.n_agents)
-    action = jax.nn.one_hot(taken, spec.n_actions, dtype=jnp.float32)
-    return Samples(before._replace(real=real), action, real.reshape(-1))
-
-
-def later(batch: Episode, spec: DiscreteSpec) -> Moments:
-    """All moments, because the encoder remembers."""
-    return moments(batch)
-
-
-def encode(encoder: GruEncoder, moments: Moments, spec: DiscreteSpec) -> Float[Array, "L E N H"]:
+def encode(encoder: GruEncoder, moments: Moments, spec: DiscreteSpec) -> Float[Array, "L R N H"]:
     """Embeddings of every agent at every moment."""
-    return embed_episodes(encoder, moments.obs, moments.last_action)
+    return embed_episodes(encoder, moments.obs, moments.last_action, moments.first)
 
 
 def logits(z: Float[Array, "*b N H"], head: Head) -> Float[Array, "*b N A"]:
@@ -139,7 +141,7 @@ def logits(z: Float[Array, "*b N H"], head: Head) -> Float[Array, "*b N A"]:
 
 
 def act(
-    z: Float[Array, "L E N H"],
+    z: Float[Array, "L R N H"],
     head: Head,
     moments: Moments,
     key: PRNGKeyArray,
@@ -151,7 +153,7 @@ def act(
 
 
 def target_action(
-    z: Float[Array, "L E N H"],
+    z: Float[Array, "L R N H"],
     head: Head,
     moments: Moments,
     key: PRNGKeyArray,
@@ -201,13 +203,17 @@ def only(values: Float[Array, "1 B"]) -> Float[Array, "B"]:
     return values[0]
 
 
-def td_target(batch: Episode, value: Float[Array, "moments"], config: Config) -> Float[Array, "B"]:
-    """TD(lambda) targets of every step; ``value`` holds those of all moments."""
+def td_target(batch: Slots, value: Float[Array, "moments"], config: Config) -> Float[Array, "B"]:
+    """TD(lambda) targets of every step; ``value`` holds those of all slots."""
     facmac = config.facmac
-    reward, terminated = jnp.swapaxes(batch.reward, 0, 1), jnp.swapaxes(batch.terminated, 0, 1)
-    next_value = value.reshape(reward.shape[0] + 1, -1)[1:]
+    by_slot = value.reshape(batch.reward.shape)
     return lambda_returns(
-        reward, terminated, next_value, batch.length, facmac.discount, facmac.td_lambda
+        batch.reward[:-1],
+        batch.terminated[:-1],
+        by_slot[1:],
+        batch.acted[:-1],
+        facmac.discount,
+        facmac.td_lambda,
     ).reshape(-1)
 
 
@@ -223,34 +229,37 @@ def state_values(value: StateValue, moments: Moments) -> Float[Array, "B"]:
 
 
 def mutual_information(
-    mine: Mine, moments: Moments, z: Float[Array, "T E N H"], key: PRNGKeyArray
+    mine: Mine, moments: Moments, z: Float[Array, "T R N H"], key: PRNGKeyArray
 ) -> Float[Array, "1 B"]:
     """Signals of every step, averaged over the agents that have something to choose.
 
-    The steps of a minibatch are thrown together and dealt out anew, E to a group; a step's
+    The steps of a minibatch are thrown together and dealt out anew, `GROUP` at a time; a step's
     negatives are the same agent's embeddings at the other steps of its group. All pairs of a
     minibatch would be a thousand times as many as its steps. An agent with one available action
     (a dead one) has no part in it.
     """
-    steps, episodes, agents, _ = z.shape
+    agents = z.shape[2]
     living = jnp.sum(moments.avail_actions, axis=-1) > 1
     counted = living.astype(z.dtype) * moments.real[..., None]
-    deal = jax.random.permutation(key, steps * episodes)
+    samples = z.shape[0] * z.shape[1]
+    groups = -(-samples // GROUP)
+    deal = jax.random.permutation(key, groups * GROUP)
 
     def dealt(x: Array) -> Array:
-        flat = x.reshape(steps * episodes, *x.shape[2:])
-        return flat[deal].reshape(steps, episodes, *flat.shape[1:])
+        flat = x.reshape(samples, *x.shape[2:])
+        missing = jnp.zeros((groups * GROUP - samples, *flat.shape[1:]), flat.dtype)
+        return jnp.concatenate([flat, missing])[deal].reshape(groups, GROUP, *flat.shape[1:])
 
     state, embedding, count = dealt(moments.state), dealt(z), dealt(counted)
-    x = jax.nn.leaky_relu(mine.state_hidden(state.reshape(steps * episodes, -1)))
-    x = jax.nn.leaky_relu(mine.state_out(x)).reshape(steps, episodes, -1)
-    y = mine.embedding(embedding.reshape(steps * episodes * agents, -1))
-    y = y.reshape(steps, episodes, agents, -1)
+    x = jax.nn.leaky_relu(mine.state_hidden(state.reshape(groups * GROUP, -1)))
+    x = jax.nn.leaky_relu(mine.state_out(x)).reshape(groups, GROUP, -1)
+    y = mine.embedding(embedding.reshape(groups * GROUP * agents, -1))
+    y = y.reshape(groups, GROUP, agents, -1)
     scores = jnp.einsum("gtm,gknm->gntk", x, y)
     signal = jax.vmap(jax.vmap(mutual_information_signal, in_axes=(0, 1)))(scores, count)
     total = jnp.sum(jnp.swapaxes(signal, 1, 2) * count, axis=2)
     mean = total / jnp.maximum(jnp.sum(count, axis=2), 1.0)
-    return mean.reshape(-1)[jnp.argsort(deal)][None]
+    return mean.reshape(-1)[jnp.argsort(deal)[:samples]][None]
 
 
 def policy_due(step: Int[Array, ""], config: Config) -> bool:
