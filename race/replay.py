@@ -76,13 +76,14 @@ def slots_of(replay: Replay, layout: Layout) -> Slots:
 
     def at(column: Array, time: Array, there: Array) -> Array:
         found = column[layout.place, time]
-        return jnp.where(there.reshape(*there.shape, *[1] * (found.ndim - 2)), found, 0)
+        shown = there.reshape(*there.shape, *[1] * (found.ndim - 2))
+        return jnp.where(shown, found, jnp.zeros_like(found))
 
     last_action = data.action[layout.place, before].astype(jnp.int32)
     return Slots(
         obs=at(data.obs, time, real),
         state=at(data.state, time, real),
-        avail_actions=at(data.avail_actions, time, real).astype(bool),
+        avail_actions=at(data.avail_actions, time, real),
         action=at(data.action, made, acted),
         last_action=jnp.where((layout.time > 0)[..., None], last_action, -1),
         reward=at(data.reward, made, acted),

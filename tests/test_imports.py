@@ -13,6 +13,7 @@ MATHEMATICS = {
     "networks",
     "critics",
     "optimization",
+    "packing",
     "replay",
     "returns",
     "exploration",

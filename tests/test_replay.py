@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from race.replay import Replay, distinct_places, episodes_at, init_replay, insert, sample
+from race.replay import Layout, Replay, distinct_places, init_replay, insert, sample, slots_of
 from race.rollouts.episodes import empty_episode
 from race.rollouts.transitions import empty_transition
 from race.types import DiscreteSpec, EnvSpec, Episode, Transition
@@ -22,7 +22,7 @@ ITEM = empty_transition(SPEC)
 _insert = jax.jit(insert)
 _sample = jax.jit(sample, static_argnames="batch_size")
 _distinct_places = jax.jit(distinct_places, static_argnames="batch_size")
-_episodes_at = jax.jit(episodes_at, static_argnames="steps")
+_slots_of = jax.jit(slots_of)
 
 
 def rows_from(first: int, length: int = ROWS) -> Transition:
@@ -159,23 +159,32 @@ def test_columns_have_the_shapes_and_types_of_the_item(precision: str) -> None:
         assert not np.asarray(column).any()
 
 
-@pytest.mark.parametrize("steps", [1, 4, 6])
-def test_episodes_are_cut_and_stay_whole(steps: int) -> None:
+def test_slots_hold_the_moments_of_their_episodes_and_nothing_else() -> None:
     replay = filled_with_episodes(12)
-    places = jnp.array([3, 0, 6, 3], jnp.int32)
-    numbers = [10, 7, 6, 10]  # place 3 holds 10 since the eleventh episode, and so on
-    batch = _episodes_at(replay, places, steps=steps)
-    for row, number in enumerate(numbers):
-        whole = episodes_from(number, 1)
+    # Place 3 holds episode 10 since the eleventh was stored, place 6 still episode 6.
+    numbers = {3: 10, 6: 6}
+    lengths = {place: int(replay.data.length[place]) for place in numbers}
+    assert lengths == {3: 5, 6: 1}
+    place = np.array([[3, 6], [3, 6], [3, 0], [3, 3], [3, 3], [3, 3], [0, 0]], np.int32)
+    time = np.array([[0, 0], [1, 1], [2, -1], [3, 0], [4, 1], [5, 2], [-1, -1]], np.int32)
+    slots = _slots_of(replay, Layout(jnp.asarray(place), jnp.asarray(time)))
+    for slot, row in np.ndindex(place.shape):
+        t, there = time[slot, row], place[slot, row]
+        step = bool(0 <= t < lengths.get(there, 0)) and t >= 0
+        assert bool(slots.real[slot, row]) == (t >= 0)
+        assert bool(slots.acted[slot, row]) == step
+        assert bool(slots.first[slot, row]) == (t == 0)
+        whole = episodes_from(numbers.get(there, 0), 1)
         for name in ("obs", "state", "avail_actions"):
-            expected = getattr(whole, name)[0, : steps + 1]
-            np.testing.assert_array_equal(getattr(batch, name)[row], expected)
+            expected = getattr(whole, name)[0, t] if t >= 0 else 0
+            np.testing.assert_array_equal(getattr(slots, name)[slot, row], expected)
         for name in ("action", "reward", "terminated"):
-            np.testing.assert_array_equal(
-                getattr(batch, name)[row], getattr(whole, name)[0, :steps]
-            )
-        assert int(batch.length[row]) == int(whole.length[0])
-    assert [column.dtype for column in batch] == [column.dtype for column in replay.data]
+            expected = getattr(whole, name)[0, t] if step else 0
+            np.testing.assert_array_equal(getattr(slots, name)[slot, row], expected)
+        before = whole.action[0, t - 1] if t > 0 else -1
+        np.testing.assert_array_equal(slots.last_action[slot, row], before)
+    for name in ("obs", "state", "avail_actions", "action", "reward", "terminated"):
+        assert getattr(slots, name).dtype == getattr(replay.data, name).dtype
 
 
 @pytest.mark.parametrize(("inserted", "present"), [(2, 2), (5, 5), (7, 7), (16, 7)])
