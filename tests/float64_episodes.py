@@ -32,7 +32,7 @@ def sp(x: Any) -> Any:
     return np.logaddexp(0.0, x)
 
 
-def sigmoid(x: np.ndarray) -> np.ndarray:
+def sigmoid(x: Any) -> Any:
     return 1.0 / (1.0 + np.exp(-x))
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from float64_episodes import float64, gru_moment, sigmoid
 
+from race import recurrent
 from race.gru import Gates, gru, gru_step
 from race.recurrent import (
     GruEncoder,
-    embed_episodes,
     embed_step,
     gate_inputs,
     init_gru_encoder,
@@ -38,6 +38,12 @@ def seen() -> tuple[jax.Array, jax.Array]:
     obs = jax.random.normal(obs_key, (L, B, N, OBS))
     last = jax.random.randint(action_key, (L, B, N), 0, A)
     return obs, last.at[0].set(-1)
+
+
+def embed_episodes(encoder: GruEncoder, obs: jax.Array, last: jax.Array) -> jax.Array:
+    """Each row is one episode."""
+    first = jnp.zeros(obs.shape[:2], bool).at[0].set(True)
+    return recurrent.embed_episodes(encoder, obs, last, first)
 
 
 def step_by_step(encoder: Any, obs: Any, last: Any) -> np.ndarray:
@@ -123,7 +129,7 @@ def test_agents_have_memories_of_their_own_and_differ_by_number(
     # Agents who see and do the same are told apart by their number alone.
     alike = jnp.broadcast_to(obs[:, :, :1], obs.shape), jnp.broadcast_to(last[:, :, :1], last.shape)
     z = embed_episodes(encoder, *alike)
-    assert not np.isclose(z[:, :, 0], z[:, :, 1]).any(axis=-1).all(axis=(0, 1))
+    assert (jnp.abs(z[:, :, 0] - z[:, :, 1]).max(axis=-1) > 1e-3).all()
     nameless = dataclasses.replace(encoder, agent=jnp.zeros_like(encoder.agent))
     z = embed_episodes(nameless, *alike)
     assert jnp.array_equal(z[:, :, 0], z[:, :, 1])
@@ -168,6 +174,18 @@ def test_what_comes_later_changes_nothing_before(
     np.testing.assert_allclose(longer[:L], usual, rtol=1e-6)
 
 
+def test_episodes_that_lie_end_to_end_do_not_remember_each_other(
+    encoder: GruEncoder, seen: tuple[jax.Array, jax.Array]
+) -> None:
+    """Both episodes in one row, the second begun anew, are as they are side by side."""
+    obs, last = (jnp.concatenate([x[:, :1], x[:, 1:]]) for x in seen)
+    first = jnp.zeros((2 * L, 1), bool).at[jnp.array([0, L])].set(True)
+    z = recurrent.embed_episodes(encoder, obs, last, first)
+    apart = embed_episodes(encoder, *seen)
+    np.testing.assert_allclose(z[:L, 0], apart[:, 0], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(z[L:, 0], apart[:, 1], rtol=1e-5, atol=1e-6)
+
+
 def test_initial_ranges() -> None:
     """All inputs of the first layer count: what is seen, the last action, and the number."""
     fresh = init_gru_encoder(jax.random.key(2), 20, 9, 7, 64)
@@ -188,14 +206,24 @@ def test_initial_ranges() -> None:
 # --- the backward pass --------------------------------------------------------------------------
 
 
+KEEP = jnp.ones((L, ROWS)).at[0].set(0.0).at[2, 1].set(0.0).at[3, 2].set(0.0).at[4, 2].set(0.0)
+"""Row 0 is one sequence; the others are cut into two and three."""
+
+
 def scanned(weight: Gates, bias: Gates, inputs: Gates) -> jax.Array:
     """The same recurrence, differentiated automatically."""
 
-    def step(carry: jax.Array, now: Gates) -> tuple[jax.Array, jax.Array]:
-        after = gru_step(weight, bias, carry, now)
+    def step(carry: jax.Array, now: tuple[Gates, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        begun = jnp.where(now[1][:, None] > 0, carry, 0.0)
+        after = gru_step(weight, bias, begun, now[0])
         return after, after
 
-    return jax.lax.scan(step, jnp.zeros((ROWS, H)), inputs)[1]
+    return jax.lax.scan(step, jnp.zeros((ROWS, H)), (inputs, KEEP))[1]
+
+
+def packed(weight: Gates, bias: Gates, inputs: Gates) -> jax.Array:
+    """The package's own, with the same beginnings."""
+    return gru(weight, bias, inputs, KEEP)
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +241,7 @@ def test_gradients_of_all_inputs_are_those_of_a_plain_scan(
     arguments: tuple[Gates, Gates, Gates], moment: int | None
 ) -> None:
     """Of a random sum of all states, and of those of one moment alone."""
-    states, pull = jax.vjp(gru, *arguments)
+    states, pull = jax.vjp(packed, *arguments)
     expected_states, expected_pull = jax.vjp(scanned, *arguments)
     np.testing.assert_allclose(states, expected_states, rtol=1e-5, atol=1e-6)
     cotangent = jax.random.normal(jax.random.key(4), states.shape)
@@ -227,6 +255,10 @@ def test_gradients_of_all_inputs_are_those_of_a_plain_scan(
         for part in got[2]:
             assert (part[moment + 1 :] == 0).all()
             assert (part[moment] != 0).all()
+            # Nothing flows back beyond the beginning of a sequence.
+            begun = np.cumsum(np.asarray(KEEP) == 0, axis=0)
+            others = begun[: moment + 1] != begun[moment]
+            assert (np.asarray(part[: moment + 1])[others] == 0).all()
 
 
 def test_gradients_are_finite_differences(arguments: tuple[Gates, Gates, Gates]) -> None:
@@ -237,6 +269,7 @@ def test_gradients_are_finite_differences(arguments: tuple[Gates, Gates, Gates])
     def total(weight: Gates, bias: Gates, inputs: Gates) -> float:
         h, states = np.zeros((ROWS, H)), []
         for t in range(L):
+            h = np.where(np.asarray(KEEP)[t, :, None] > 0, h, 0.0)
             own = [h @ w + b for w, b in zip(weight, bias, strict=True)]
             r, u = sigmoid(inputs.reset[t] + own[0]), sigmoid(inputs.update[t] + own[1])
             h = (1 - u) * np.tanh(inputs.candidate[t] + r * own[2]) + u * h
@@ -244,7 +277,7 @@ def test_gradients_are_finite_differences(arguments: tuple[Gates, Gates, Gates])
         return float((mix * np.stack(states)).sum())
 
     def objective(*args: Gates) -> jax.Array:
-        return jnp.sum(jnp.asarray(mix, jnp.float32) * gru(*args))
+        return jnp.sum(jnp.asarray(mix, jnp.float32) * packed(*args))
 
     got = float64(jax.grad(objective, argnums=(0, 1, 2))(*arguments))
     for which, name in ((w, n) for w in range(3) for n in Gates._fields):
