@@ -72,7 +72,7 @@ def test_every_kind_of_task_is_made_and_the_narrow_maker_refuses_discrete_ones()
 
 
 def test_the_documents_example_works(directory):
-    (example,) = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    example, _ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     write(directory, "my_task.py", example)
     task = make_task("my_task:task")
     assert task.spec.obs_index == ((0, 2), (1, 3))
@@ -83,6 +83,26 @@ def test_the_documents_example_works(directory):
     assert push.episode_length.tolist() == [100, 100]
     assert not push.transitions.terminated.any()
     assert (push.episode_return > idle.episode_return).all()
+
+
+def test_the_documents_discrete_example_works(directory):
+    _, example = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    write(directory, "my_battle.py", example)
+    task = make_task("my_battle:task")
+    assert isinstance(task, DiscreteTask)
+    assert task.spec.n_actions == 3
+    env = task.make(None)
+    won = []
+    for seed in range(20):
+        observation, _ = env.reset(seed=seed)
+        numbers = observation["obs"].argmax(axis=1)
+        again, _ = env.reset(seed=seed)
+        assert (again["state"] == observation["state"]).all()
+        _, reward, terminated, _, info = env.step(numbers[::-1])
+        assert (reward, terminated, info["battle_won"]) == (1.0, True, True)
+        env.reset(seed=seed)
+        won.append(env.step(numbers)[4]["battle_won"])
+    assert set(won) == {True, False}  # one's own number is the other's by chance alone
 
 
 def test_own_function_is_given_the_config(directory):
