@@ -39,11 +39,11 @@ class LearnerConfig:
     target_update_rate: float = 0.005
     """Share of the online network mixed into its target at each target update (TD3's tau)."""
     policy_delay: int = 2
-    """Critic steps per policy, encoder and target step. MADDPG always uses 1."""
+    """Critic steps per policy, encoder and target step. MADDPG and FACMAC always use 1."""
     exploration_noise: float = 0.1
     """Standard deviation of the noise on the MARL team's actions, as a share of their range."""
     smoothing_noise: float = 0.2
-    """Standard deviation of target policy smoothing. MADDPG uses none."""
+    """Standard deviation of target policy smoothing. MADDPG and FACMAC use none."""
     smoothing_clip: float = 0.5
     """Largest smoothing noise."""
     replay_capacity: int = 1_000_000

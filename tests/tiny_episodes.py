@@ -167,9 +167,7 @@ class Step(NamedTuple):
     draws: Draws
 
 
-def stepper(
-    monkeypatch: pytest.MonkeyPatch, config: Config, algorithm: Any, fixed: bool
-) -> Callable[..., Step]:
+def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
     """A compiled gradient step whose draws are recorded.
 
     ``fixed``: draws that depend on the key and the time in an episode alone, and steps dealt out
@@ -199,16 +197,19 @@ def stepper(
         samples = np.array([laid[0].index[step] for step in sorted(laid[0].where)])[order]
         return jnp.asarray(np.concatenate([samples, np.setdiff1d(np.arange(count), samples)]))
 
-    monkeypatch.setattr(sys.modules["race.learners.facmac"], "GROUP", GROUP)
-    monkeypatch.setattr(jax.random, "gumbel", noise)
-    monkeypatch.setattr(jax.random, "permutation", deal)
     update = jax.jit(partial(algorithm.update, spec=SPEC, config=config))
 
     def step(before: Any, batch: Laid, number: int = 1) -> Step:
         laid[:] = [batch]
         for kept in draws:
             kept.clear()
-        after, critics, policies = update(before, batch.slots, jnp.int32(number), jax.random.key(5))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys.modules["race.learners.facmac"], "GROUP", GROUP)
+            patch.setattr(jax.random, "gumbel", noise)
+            patch.setattr(jax.random, "permutation", deal)
+            after, critics, policies = update(
+                before, batch.slots, jnp.int32(number), jax.random.key(5)
+            )
         jax.effects_barrier()
         losses = {name: float(x) for name, x in (critics | policies).items()}
         return Step(before, after, losses, Draws(*map(list, draws)))

@@ -52,7 +52,7 @@ class TrainingDisplay:
         """A `race.run.Report`."""
         if progress.gradient_steps == 0 and stage == "learning" and not row:
             stage = "compiling"
-        covered = _covered(progress)
+        covered = _covered(progress, self._config)
         self._bar.update(
             self._task, completed=covered, stage=stage, details=self._details(progress, covered)
         )
@@ -83,12 +83,17 @@ class TrainingDisplay:
         )
 
 
-def _covered(progress: Progress) -> float:
-    """Environment steps, those of the current generation counted as their gradient steps go."""
+def _covered(progress: Progress, config: Config) -> float:
+    """Environment steps, those of the current generation counted as its gradient steps go."""
+    made = progress.env_steps - progress.env_steps_before
     if not progress.learning:
         return float(progress.env_steps)
     learned = progress.gradient_steps - progress.gradient_steps_before
-    return float(min(progress.env_steps_before + learned, progress.env_steps))
+    if config.discrete:
+        due = config.n_teams * config.facmac.gradient_steps_per_episode
+    else:
+        due = made * config.learner.gradient_steps_per_env_step
+    return progress.env_steps_before + made * min(learned / max(due, 1.0), 1.0)
 
 
 def _test_summary(row: dict[str, Any]) -> str:
