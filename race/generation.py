@@ -158,12 +158,12 @@ def learn(run: Run, state: RunState) -> RunState:
 
 def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Layout]:
     """The next gradient steps on episodes: how many, and how their minibatches are laid out."""
-    config, room = run.config, max(EPISODES_CHUNK, run.config.n_teams)
-    count = min(room, _owed(run, state))
-    first = np.int32(state.progress.gradient_steps)
-    shared = run.statics["config"]
-    # Always as many as a generation usually has: each number would be a program of its own.
-    room = config.n_teams if count <= config.n_teams else room
+    config = run.config
+    most = max(EPISODES_CHUNK, config.n_teams)
+    count = min(most, _owed(run, state))
+    # Room for a usual generation's steps, or for the most: each number would be a program.
+    room = config.n_teams if count <= config.n_teams else most
+    first, shared = np.int32(state.progress.gradient_steps), run.statics["config"]
     drawn = programs.draw(state.replay, key, first, count=room, config=shared)
     places, lengths = (np.asarray(column)[:count] for column in drawn)
     return count, layouts(places, lengths, run.task.spec.episode_limit, room)
