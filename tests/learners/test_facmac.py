@@ -234,6 +234,9 @@ def test_rollouts_choose_as_the_learner_does(batch: Episode, nets: Networks) -> 
         )
         memory, action = choose(teams, memory, seen, np.int32(t), None)
         played.append(action)
+        for z, one in zip(memory.carry, histories, strict=True):
+            expected = embeddings(float64(nets.encoder), one)[t]
+            np.testing.assert_allclose(z, expected, rtol=1e-4, atol=1e-5)
         done = np.stack([one.action[t] for one in histories])
         memory = memory._replace(last_action=jnp.asarray(done, jnp.int32))
     for team, one in enumerate(histories):
