@@ -12,6 +12,7 @@ from race.config import TeamName
 from race.errors import ConfigError, RenderError
 
 PolicyName = Literal["scripted", "random"]
+_SECONDS = 15.0
 STEPS_PER_SECOND = 2
 """Of a battle, at the game's "normal" speed."""
 
@@ -50,7 +51,7 @@ class Render:
     seconds: Annotated[
         float | None,
         tyro.conf.arg(
-            metavar="FLOAT", help_behavior_hint="(default: 15 of a run, the whole of a battle)"
+            metavar="FLOAT", help_behavior_hint="(default: 15 of a robot, the whole of a battle)"
         ),
     ] = None
     """Simulated time to show; 0 for the whole episode."""
@@ -64,13 +65,13 @@ def main(arguments: list[str]) -> None:
     out = chosen.out or Path("battle.gif" if battle else "team.mp4")
     if out.suffix.lower() not in (".mp4", ".gif"):
         raise RenderError(f"{out} is no video: the name must end with .mp4 or .gif.")
-    seconds = chosen.seconds if chosen.seconds is not None else 0.0 if battle else 15.0
-    if chosen.seed < 0 or not 0 <= seconds < float("inf"):
+    asked = chosen.seconds
+    if chosen.seed < 0 or (asked is not None and not 0 <= asked < float("inf")):
         raise ConfigError("--seed and --seconds must be 0 or more.")
     if battle:
-        _render_battle(chosen, out, seconds)
+        _render_battle(chosen, out, asked or 0.0)
     else:
-        _render_run(chosen, out, seconds)
+        _render_run(chosen, out)
 
 
 def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
@@ -110,7 +111,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     )
 
 
-def _render_run(chosen: Render, out: Path, seconds: float) -> None:
+def _render_run(chosen: Render, out: Path) -> None:
     if chosen.policy is not None:
         raise ConfigError(
             f"--policy is for battles such as micro/2s3z, and {chosen.what} is the directory of a "
@@ -121,7 +122,7 @@ def _render_run(chosen: Render, out: Path, seconds: float) -> None:
     from race import run_directory
     from race.cli.compilation import use_cache
 
-    console = Console(stderr=True)
+    console, asked = Console(stderr=True), chosen.seconds
     discrete = run_directory.open_run(Path(chosen.what)).discrete
     renderer = None
     if not discrete:
@@ -137,9 +138,9 @@ def _render_run(chosen: Render, out: Path, seconds: float) -> None:
     with console.status("loading the team"):
         trained = load_trained(Path(chosen.what))
     drawn = (
-        _draw_discrete(chosen, trained, seconds, console)
+        _draw_discrete(chosen, trained, chosen.seconds or 0.0, console)
         if renderer is None
-        else _continuous(chosen, trained, seconds, renderer)
+        else _continuous(chosen, trained, _SECONDS if asked is None else asked, renderer)
     )
     _write(chosen, trained, drawn, out, console)
 
