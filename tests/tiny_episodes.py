@@ -90,7 +90,7 @@ class Laid(NamedTuple):
         ]
 
     @property
-    def index(self) -> dict[tuple[int, int], int]:
+    def sample_of(self) -> dict[tuple[int, int], int]:
         """The sample that each step is."""
         rows = self.slots.real.shape[1]
         return {step: slot * rows + row for step, (slot, row) in self.where.items()}
@@ -148,7 +148,7 @@ def laid_out(
 
 def groups_of(laid: Laid, deal: Any) -> list[list[tuple[int, int]]]:
     """The steps that were dealt out together; places of a deal that are no steps are left out."""
-    step_at = {place: step for step, place in laid.index.items()}
+    step_at = {place: step for step, place in laid.sample_of.items()}
     groups = (deal[start : start + GROUP] for start in range(0, len(deal), GROUP))
     return [[step_at[int(i)] for i in group if int(i) in step_at] for group in groups]
 
@@ -194,7 +194,7 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
         if not fixed:
             return record(draws.deals, permutation(key, count))
         order = np.random.default_rng(0).permutation(len(laid[0].where))
-        samples = np.array([laid[0].index[step] for step in sorted(laid[0].where)])[order]
+        samples = np.array([laid[0].sample_of[step] for step in sorted(laid[0].where)])[order]
         return jnp.asarray(np.concatenate([samples, np.setdiff1d(np.arange(count), samples)]))
 
     update = jax.jit(partial(algorithm.update, spec=SPEC, config=config))

@@ -123,9 +123,9 @@ def test_now_is_the_steps_time_first(batch: Episode, laid: Laid, now: Any) -> No
         assert np.array_equal(moments.avail_actions[place], batch.avail_actions[e, t])
         before = batch.action[e, t - 1] if t else np.full(N, -1)
         assert np.array_equal(moments.last_action[place], before)
-        assert np.array_equal(action[laid.index[e, t]], np.eye(A)[batch.action[e, t]])
+        assert np.array_equal(action[laid.sample_of[e, t]], np.eye(A)[batch.action[e, t]])
         assert moments.first[place] == (t == 0)
-    steps = sorted(laid.index.values())
+    steps = sorted(laid.sample_of.values())
     assert np.flatnonzero(mask).tolist() == steps
     assert np.array_equal(moments.real.reshape(-1), mask)
     assert mask.sum() == sum(LENGTHS)
