@@ -213,6 +213,7 @@ def test_another_seed_is_another_run(
     assert other != rows(uninterrupted("race", "probe/lives"), "generation")[: len(other)]
 
 
+@pytest.mark.slow
 def test_an_extended_run_is_the_longer_run(tmp_path: Path) -> None:
     """Also where the short run's buffer had no room for what the longer one collects."""
     room = {"replay_capacity": 500}
@@ -298,6 +299,7 @@ def test_learning_is_traced_once_per_shape_and_sees_whole_episodes(
     assert dict(programs.TRACES) == traced
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("task", "has_wins"), [("probe/memory", True), ("probe/lives", False)])
 @pytest.mark.parametrize("algo", ["race", "facmac"])
 def test_win_rates_are_written_where_there_are_wins(
@@ -317,6 +319,7 @@ def test_win_rates_are_written_where_there_are_wins(
     assert not any("win_rate" in name for row in rows(tmp_path, "generation") for name in row)
 
 
+@pytest.mark.slow
 def test_evaluations_come_every_so_many_steps_of_32_episodes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -345,8 +348,10 @@ def test_evaluations_come_every_so_many_steps_of_32_episodes(
 # Learning.
 
 
-def best_test(path: Path, task: str, algo: str, env_steps: int, **facmac: Any) -> list[float]:
-    """The returns of the selected team's tests."""
+def selected_returns(
+    path: Path, task: str, algo: str, env_steps: int, ratio: float = 1.0, **changes: Any
+) -> list[float]:
+    """Of the selected team's tests; ``ratio`` is that of gradient steps to episodes."""
     settings = {"mixer_size": 8, "hypernet_size": 8, "hidden_size": 16, "batch_size": 16}
     config = small(
         task,
@@ -357,24 +362,25 @@ def best_test(path: Path, task: str, algo: str, env_steps: int, **facmac: Any) -
             "epsilon_steps": env_steps // 2,
             "target_update_every": 50,
             "replay_capacity": 2000,
-            "gradient_steps_per_episode": 1.0,
-            **facmac,
+            "gradient_steps_per_episode": ratio,
         },
         algo=algo,
         env_steps=env_steps,
         evaluation=EvaluationConfig(every=env_steps // 4, episodes=32),
         checkpoint=CheckpointConfig(minutes=60.0),
+        **changes,
     )
     run(path, config)
     return [row["eval/selected/return_mean"] for row in rows(path, "evaluation")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("algo", "env_steps"), [("facmac", 400), ("race", 600)])
 def test_learners_solve_the_matching_of_cues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, env_steps: int
 ) -> None:
     monkeypatch.setattr(generation, "EPISODES_CHUNK", 12)
-    found = best_test(tmp_path, "probe/matching", algo, env_steps)
+    found = selected_returns(tmp_path, "probe/matching", algo, env_steps)
     assert found[-1] >= 0.9 * PROBES["probe/matching"].optimal_return
     # Agents that choose any available action are right 0.4 of the time.
     assert found[0] < 0.9
@@ -383,5 +389,10 @@ def test_learners_solve_the_matching_of_cues(
 @pytest.mark.slow
 def test_race_climbs_to_the_better_optimum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generation, "EPISODES_CHUNK", 12)
-    found = best_test(tmp_path, "probe/climb", "race", 1000)
+    population = RaceConfig(policy_embedding_size=3, mine_size=5, population_size=9)
+    found = selected_returns(
+        tmp_path, "probe/climb", "race", 2000, ratio=0.2, race=population, seed=2
+    )
     assert found[-1] == CLIMB_PAYOFFS[0][0]
+    # It was not there to begin with.
+    assert rows(tmp_path, "generation")[0]["population/fitness_max"] <= CLIMB_PAYOFFS[2][2]

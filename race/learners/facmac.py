@@ -236,7 +236,7 @@ def mutual_information(
     The steps of a minibatch are thrown together and dealt out anew, `GROUP` at a time; a step's
     negatives are the same agent's embeddings at the other steps of its group. All pairs of a
     minibatch would be a thousand times as many as its steps. An agent with one available action
-    (a dead one) has no part in it.
+    (a dead one) has no part in it; the signal of a step at which all are such is 0.
     """
     agents = z.shape[2]
     living = jnp.sum(moments.avail_actions, axis=-1) > 1
