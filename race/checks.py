@@ -127,7 +127,7 @@ def check(config: Config) -> None:
             learner.gradient_steps_per_env_step,
             "in (0, 100]",
         ),
-        *_facmac_rules(facmac),
+        *_facmac_rules(facmac, config.n_teams),
         (
             race.population_size >= 4,
             "race.population-size",
@@ -185,7 +185,7 @@ def check(config: Config) -> None:
             raise ConfigError(f"--{name} is {value}, but it must be {must}.")
 
 
-def _facmac_rules(facmac: FacmacConfig) -> list[Rule]:
+def _facmac_rules(facmac: FacmacConfig, n_teams: int) -> list[Rule]:
     sizes: dict[str, Any] = {
         "mixer-size": facmac.mixer_size,
         "hypernet-size": facmac.hypernet_size,
@@ -213,10 +213,17 @@ def _facmac_rules(facmac: FacmacConfig) -> list[Rule]:
     rules += [
         (facmac.batch_size >= 2, "batch-size", facmac.batch_size, "at least 2"),
         (
-            facmac.batch_size <= facmac.replay_capacity <= MOST_TRANSITIONS,
+            max(facmac.batch_size, n_teams) <= facmac.replay_capacity,
             "replay-capacity",
             facmac.replay_capacity,
-            f"at least a minibatch (facmac.batch-size {facmac.batch_size})",
+            f"at least a minibatch (facmac.batch-size {facmac.batch_size}) and an episode of each "
+            f"team ({n_teams})",
+        ),
+        (
+            facmac.replay_capacity <= MOST_TRANSITIONS,
+            "replay-capacity",
+            facmac.replay_capacity,
+            f"at most {MOST_TRANSITIONS}",
         ),
         (0 <= facmac.discount < 1, "discount", facmac.discount, "in [0, 1)"),
         (

@@ -24,7 +24,8 @@ COMMANDS = {
 _OUT_OF_MEMORY = (
     "this machine does not have the memory for it. Use smaller networks or batches "
     "(--learner.hidden-sizes, --learner.batch-size) or a smaller buffer "
-    "(--learner.replay-capacity)."
+    "(--learner.replay-capacity). On tasks with discrete actions these are --facmac.hidden-size, "
+    "--facmac.batch-size and --facmac.replay-capacity."
 )
 
 _EXAMPLE = """\

@@ -11,7 +11,7 @@ import tyro
 from race.config import TeamName
 from race.errors import ConfigError
 
-BATCH = 20
+BATCH = 32
 """Episodes played at the same time."""
 
 

@@ -174,13 +174,13 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
     task = trained.config.task
     if chosen.seed >= 2**31:
         raise ConfigError(f"The --seed of an episode must be below {2**31}.")
+    head = trained.heads[trained.resolve(chosen.team or "selected")]
     # Without somebody to draw, there is nothing to play either.
     env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
     with (
         console.status("playing the episode"),
         EpisodeRollouts(trained.config, trained.task) as rollouts,
     ):
-        head = trained.heads[trained.resolve(chosen.team or "selected")]
         actions = rollouts.episode(trained.encoder, head, chosen.seed)
     if env is not None:
         steps = len(actions) if seconds == 0 else math.ceil(seconds * STEPS_PER_SECOND)
@@ -203,21 +203,24 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
 
 
 def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
-    total = 0.0
+    total, steps = 0.0, 0
 
     def frames() -> Iterator[Any]:
-        nonlocal total
+        nonlocal total, steps
         try:
             env.reset(seed=seed)
             yield env.render()
             for action in actions:
-                total += float(env.step(action)[1])
+                _, reward, terminated, truncated, _ = env.step(action)
+                total, steps = total + float(reward), steps + 1
                 yield env.render()
+                if terminated or truncated:
+                    break
         finally:
             env.close()
 
     fps = float(env.metadata.get("render_fps") or STEPS_PER_SECOND)
-    return _Drawn(frames(), len(actions) + 1, fps, lambda: (len(actions), total, ""))
+    return _Drawn(frames(), len(actions) + 1, fps, lambda: (steps, total, ""))
 
 
 def _write(chosen: Render, trained: Any, drawn: _Drawn, out: Path, console: Any) -> None:

@@ -27,6 +27,8 @@ from race.types import DiscreteTask
 
 TESTS_AT_ONCE = 32
 """Test episodes of a team in one program; a program serves one number of them only."""
+TESTS_AT_ONCE_ON_HOST = 4
+"""There they are played one after the other anyway, and a game may be large."""
 
 
 @final
@@ -44,6 +46,8 @@ class EpisodeRollouts:
         self._config, self._spec = config, task.spec
         self._env = task.device() if on_device and task.device is not None else None
         self._host = HostEnvs(task)
+        self._most = TESTS_AT_ONCE if self._env is not None else TESTS_AT_ONCE_ON_HOST
+        self._tests = 0  # at once, so far
 
     def empty_replay(self) -> Replay:
         """A short run does not pay for a long one's memory: an episode has at least one step."""
@@ -86,13 +90,12 @@ class EpisodeRollouts:
     ) -> dict[str, Score]:
         """At most `TESTS_AT_ONCE` episodes of each team at once."""
         names, n = list(heads), len(seeds)
-        size = min(n, TESTS_AT_ONCE)
+        size = self._tests = max(self._tests, min(n, self._most))
         teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), size, axis=0))
         parts = []
         for first in range(0, n, size):
             piece = seeds[first : first + size]
-            filled = np.concatenate([piece, seeds[: size - len(piece)]])
-            played = self._play(teams, np.tile(filled, len(names)), None)
+            played = self._play(teams, np.tile(np.resize(piece, size), len(names)), None)
             results = (played.episode_return, played.episodes.length, played.won)
             shape = (len(names), size)
             parts.append([np.asarray(r).reshape(shape)[:, : len(piece)] for r in results])

@@ -53,7 +53,10 @@ class HostEnvs:
         """
         spec, count = self.task.spec, len(seeds)
         while len(self._envs) < count:
-            self._envs.append(self.task.make(None))
+            try:
+                self._envs.append(self.task.make(None))
+            except Exception as error:
+                raise self._failed(error, f"making of environment {len(self._envs)}") from error
         episodes = empty_episode(spec, precision, count)
         returns, won = np.zeros(count, np.float32), np.zeros(count, bool)
         seen = Observation(
@@ -126,13 +129,16 @@ class HostEnvs:
                     )
                 column[team] = value
         except Exception as error:
-            frames = traceback.extract_tb(error.__traceback__)
-            place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
-            raise TaskError(
-                f"The environment of {self.task.spec.task} failed (environment {team}): "
-                f"{type(error).__name__}: {error}{place}."
-            ) from error
+            raise self._failed(error, f"environment {team}") from error
         return outcome
+
+    def _failed(self, error: Exception, what: str) -> TaskError:
+        frames = traceback.extract_tb(error.__traceback__)
+        place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+        return TaskError(
+            f"The environment of {self.task.spec.task} failed ({what}): "
+            f"{type(error).__name__}: {error}{place}."
+        )
 
 
 def _write(episodes: Any, seen: Observation, team: int, place: int) -> None:

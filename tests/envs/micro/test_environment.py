@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from race.envs import make_discrete_task, make_task
+from race.envs import make_continuous_task, make_discrete_task, make_task
 from race.envs.micro import Battle, load_map, make, map_names
 from race.envs.micro.battle import FIRST_TARGET, NORTH, STOP, WEST
 from race.envs.micro.environment import MicroEnv
@@ -170,7 +170,7 @@ def test_misuse_is_refused(played: Battle) -> None:
 
 @pytest.mark.parametrize("name", map_names())
 def test_sizes_are_known_before_a_map_is_built(name: str) -> None:
-    spec, _ = make_discrete_task(f"micro/{name}")
+    spec = make_discrete_task(f"micro/{name}").spec
     shape = make(name).shape
     assert spec.task == f"micro/{name}"
     assert (spec.n_agents, spec.n_actions) == (shape.n_allies, shape.n_actions)
@@ -204,9 +204,10 @@ def test_other_tasks_are_refused(task: str, message: str) -> None:
         make_discrete_task(task)
 
 
-def test_learners_of_continuous_actions_are_not_given_battles() -> None:
-    with pytest.raises(TaskError, match=r"continuous.*race render micro/2s3z.*make_discrete_task"):
-        make_task("micro/2s3z")
+def test_a_battle_is_a_task_like_others() -> None:
+    assert make_task("micro/2s3z").spec == make_discrete_task("micro/2s3z").spec
+    with pytest.raises(TaskError, match="discrete actions"):
+        make_continuous_task("micro/2s3z")
     with pytest.raises(TaskError, match="3s5z"):
         make_task("micro/3s5x")
     with pytest.raises(TaskError, match="micro/2s3z"):
