@@ -6,7 +6,7 @@
 
 import dataclasses
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from typing import Any
 
@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 
 # Tests compile many small programs and run each a few times: compiling fast beats running fast.
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
@@ -25,6 +26,18 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 def cache_of_its_own(tmp_path_factory: pytest.TempPathFactory) -> None:
     """Commands that tests run keep their compiled programs away from the user's cache."""
     os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("cache"))
+
+
+@pytest.fixture(autouse=True)
+def cache_of_commands_alone() -> Iterator[None]:
+    """Commands turn the cache of compiled programs on; later tests must not go on writing to it.
+
+    Writing a large program of a process that holds many has been seen to crash jaxlib.
+    """
+    yield
+    if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
+        jax.config.update("jax_compilation_cache_dir", None)
+        compilation_cache.reset_cache()
 
 
 @pytest.fixture(scope="session")
