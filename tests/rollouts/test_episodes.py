@@ -270,7 +270,8 @@ def test_teams_did_what_their_networks_say_of_the_episode(name: str, on_device: 
     obs, taken = (np.swapaxes(column, 0, 1) for column in (episodes.obs, episodes.action))
     taken = taken.astype(np.int32)
     last = np.concatenate([np.full_like(taken[:1], -1), taken])
-    z = embed_episodes(teams.encoder, jnp.asarray(obs), jnp.asarray(last))
+    first = jnp.zeros(last.shape[:2], bool).at[0].set(True)
+    z = embed_episodes(teams.encoder, jnp.asarray(obs), jnp.asarray(last), first)
     for team in range(5):
         scores = logits(z[:, team], teams.heads[team])
         chosen = greedy(scores, jnp.asarray(episodes.avail_actions[team]))
