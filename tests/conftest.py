@@ -8,6 +8,7 @@ import dataclasses
 import os
 from collections.abc import Callable, Iterator
 from functools import cache, partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,6 +21,9 @@ from jax.experimental.compilation_cache import compilation_cache
 os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+MOST_MAPPINGS = 25_000
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,6 +42,18 @@ def cache_of_commands_alone() -> Iterator[None]:
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         jax.config.update("jax_compilation_cache_dir", None)
         compilation_cache.reset_cache()
+
+
+@pytest.fixture(autouse=True)
+def few_programs() -> Iterator[None]:
+    """Forgets compiled programs before their memory mappings are more than a process may have.
+
+    Linux allows 65,530; a gradient step of RACE takes thousands, and jaxlib crashes at the limit.
+    """
+    yield
+    mappings = Path("/proc/self/maps")
+    if mappings.exists() and mappings.read_bytes().count(b"\n") > MOST_MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")
