@@ -291,7 +291,7 @@ def test_render_a_battle(
         ("train micro/2s3z --facmac.actor-learning-rate inf", "finite"),
         ("train micro/2s3z --facmac.epsilon-start 1.5", "[0, 1]"),
         ("train micro/2s3z --facmac.td-lambda nan", "td-lambda"),
-        ("train probe/chain --facmac.mixer-size 0", "at least 1"),
+        ("train probe/chain --base facmac --facmac.mixer-size 0", "at least 1"),
         ("train micro/2s3y", "2s3z"),
         ("plot", "which runs"),
         ("plot nowhere", "not a directory"),

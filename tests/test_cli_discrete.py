@@ -20,12 +20,15 @@ from race.rollouts.discrete import EpisodeRollouts
 from race.trained import load_trained
 from race.types import DiscreteTask
 
-NETWORKS = (
-    "--facmac.hidden-size 6 --facmac.mixer-size 3 --facmac.hypernet-size 4 "
-    "--facmac.utility-sizes 5 4 --facmac.value-size 4 --facmac.batch-size 4 "
-    "--race.policy-embedding-size 4 --race.mine-size 5"
+MIXER = "--facmac.mixer-size 3 --facmac.hypernet-size 4"
+RACE = (
+    "--race.policy-embedding-size 4 --race.mine-size 5 --race.population-size 4 "
+    "--evaluation.every 40 --evaluation.episodes 2"
 )
-SMALL = f"{NETWORKS} --race.population-size 4 --evaluation.every 40 --evaluation.episodes 2"
+SMALL = (
+    f"{MIXER} {RACE} --facmac.hidden-size 6 --facmac.utility-sizes 5 4 --facmac.value-size 4 "
+    "--facmac.batch-size 4"
+)
 DRAWN = "test_cli_discrete:drawn"
 
 
@@ -334,6 +337,16 @@ def test_every_setting_of_facmac_is_tried() -> None:
         ("train probe/matching --base matd3", "RACE(MATD3) does not work on probe/matching"),
         ("train probe/matchin", "probe/matching"),
         ("train micro/3s_vs_4z", "nearest names are 3s_vs_3z"),
+        ("train probe/matching --preset td3", "--preset td3 has no effect on probe/matching"),
+        (
+            "train probe/matching --learner.batch-size 8 --learner.discount 0.9",
+            "--learner.batch-size and --learner.discount would have no effect",
+        ),
+        ("train probe/chain --facmac.mixer-size 8", "--facmac.mixer-size would have no effect"),
+        (
+            "train probe/chain --algo facmac --facmac.mixer-size 8 --facmac.td-lambda 0.5",
+            "--facmac.td-lambda would have no effect",
+        ),
     ],
 )
 def test_what_cannot_be_trained(
@@ -348,7 +361,7 @@ def test_facmac_on_continuous_actions(capsys: pytest.CaptureFixture[str]) -> Non
         "--learner.random-steps 30 --learner.batch-size 8 --learner.hidden-sizes 12 8 "
         "--env-steps 60 --learner.gradient-steps-per-env-step 0.1"
     )
-    race(f"train mamujoco/Hopper-3x1 --base facmac --run-dir run {continuous} {SMALL}")
+    race(f"train mamujoco/Hopper-3x1 --base facmac --run-dir run {continuous} {MIXER} {RACE}")
     assert "RACE(FACMAC) on mamujoco/Hopper-3x1" in capsys.readouterr().out
     race("evaluate run --episodes 2 --json")
     result = json.loads(capsys.readouterr().out)

@@ -8,14 +8,15 @@ from pathlib import Path
 import pytest
 
 from race.cli import COMMANDS, main
+from race.envs import make_task
+from race.types import DiscreteTask
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "results/README.md"]
 
 # Options given twice count as given last, so that these make any training a short one.
 SMALL = {
-    "train": "--env-steps 700 --learner.random-steps 600 --learner.hidden-sizes 10 8 "
-    "--learner.batch-size 4 --learner.gradient-steps-per-env-step 0.01 --evaluation.episodes 1",
+    "train": "--env-steps 700 --evaluation.episodes 1",
     "resume": "--env-steps 13000",
     "evaluate": "--episodes 1",
     "render": "--seconds 0.3",
@@ -24,6 +25,19 @@ SMALL = {
     "list": "",
     "doctor": "",
 }
+
+CONTINUOUS = (
+    "--learner.random-steps 600 --learner.hidden-sizes 10 8 "
+    "--learner.batch-size 4 --learner.gradient-steps-per-env-step 0.01"
+)
+
+
+def small(words: list[str]) -> list[str]:
+    """A command that is done soon."""
+    options = shlex.split(SMALL[words[0]])
+    if words[0] == "train" and not isinstance(make_task(words[1]), DiscreteTask):
+        options += shlex.split(CONTINUOUS)
+    return [*words, *options]
 
 
 def shown(document: Path) -> list[str]:
@@ -44,16 +58,15 @@ def test_commands_in_documents_run(
         # Documents after the README may use the run that its first command makes.
         first = ["train", "mamujoco/HalfCheetah-2x3", "--run-dir", "runs/first"]
         if any("runs/first" in line for line in shown(document)):
-            main([*first, *shlex.split(SMALL["train"]), "--env-steps", "7000"])
+            main([*small(first), "--env-steps", "7000"])
     for line in shown(document):
         words = shlex.split(line)
-        words = words[words.index("race") + 1 :]
-        main([*words, *shlex.split(SMALL[words[0]])])
+        main(small(words[words.index("race") + 1 :]))
 
 
 def test_modules_called_in_documents_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
-    small = {"cases": "", "tournament": "--battles 2 3s_vs_3z"}
+    shortened = {"cases": "", "tournament": "--battles 2 3s_vs_3z"}
     called = []
     for document in DOCUMENTS:
         for block in re.findall(r"```sh\n(.*?)```", document.read_text(), re.DOTALL):
@@ -67,7 +80,7 @@ def test_modules_called_in_documents_run(monkeypatch: pytest.MonkeyPatch) -> Non
                     for file in (sorted(ROOT.glob(word)) or [word])
                 ]
                 run = importlib.import_module(f"race.envs.micro.{module}").main
-                assert run([*files, *shlex.split(small[module])]) == 0
+                assert run([*files, *shlex.split(shortened[module])]) == 0
     assert sorted(set(called)) == ["cases", "tournament"]
 
 

@@ -1,9 +1,10 @@
 """``race train``."""
 
 import dataclasses
+from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
@@ -19,6 +20,7 @@ from race.config import (
     Preset,
     RaceConfig,
 )
+from race.errors import ConfigError
 from race.presets import PRESETS, resolve
 from race.types import DiscreteTask
 
@@ -47,7 +49,7 @@ class Train:
     """Where the run is kept. Default: runs/TASK-ALGO-seedN."""
     preset: Preset = "paper"
     """Learner settings to start from: the paper's, those of the official TD3 code, or small
-    networks for a quick look."""
+    networks for a quick look. On tasks with discrete actions there is only the paper's."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     facmac: FacmacConfig = field(default_factory=FacmacConfig)
     race: RaceConfig = field(default_factory=RaceConfig)
@@ -72,7 +74,9 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
 
     task = make_task(asked.task, asked.env)
-    config = resolve(asked, discrete=isinstance(task, DiscreteTask))
+    discrete = isinstance(task, DiscreteTask)
+    _refuse_without_effect(asked, chosen.preset, discrete)
+    config = resolve(asked, discrete=discrete)
     path = chosen.run_dir or Path("runs") / _name(config)
     run_directory.create(path, config, describe(task))
     run(path, config)
@@ -83,6 +87,37 @@ def _parse(arguments: list[str]) -> Train:
     first = tyro.cli(Train, args=arguments, prog="race train")
     default = Train(task=first.task, learner=PRESETS[first.preset])
     return tyro.cli(Train, args=arguments, prog="race train", default=default)
+
+
+def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> None:
+    """Settings of a learner that would not be used are mistakes, and costly ones if not told."""
+    kind = "discrete" if discrete else "continuous"
+    if discrete and preset != "paper":
+        raise ConfigError(
+            f"--preset {preset} has no effect on {asked.task}: its actions are discrete, and the "
+            "presets are of learners of continuous actions. Leave it out; --facmac.* are the "
+            "settings of the learner on this task."
+        )
+    if discrete:
+        unused = _changed("learner", asked.learner, LearnerConfig())
+        instead = "--facmac.*"
+    else:
+        # The mixer is all that FACMAC shares with its form for continuous actions.
+        mixes = "facmac" in (asked.algo, asked.base)
+        used = {"mixer_size", "hypernet_size"} if mixes else set()
+        unused = _changed("facmac", asked.facmac, FacmacConfig(), used)
+        instead = "--learner.*"
+    if unused:
+        raise ConfigError(
+            f"{' and '.join(unused)} would have no effect on {asked.task}: its actions are {kind}, "
+            f"and the settings of its learner are {instead}. Leave out what has no effect."
+        )
+
+
+def _changed(group: str, asked: Any, default: Any, used: Set[str] = frozenset()) -> list[str]:
+    names = [f.name for f in dataclasses.fields(asked) if f.name not in used]
+    changed = [name for name in names if getattr(asked, name) != getattr(default, name)]
+    return [f"--{group}.{name.replace('_', '-')}" for name in changed]
 
 
 def _name(config: Config) -> str:
