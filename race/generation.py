@@ -124,11 +124,12 @@ def learn(run: Run, state: RunState) -> RunState:
     """
     progress = state.progress
     key, first = root_key(run.config, Purpose.LEARNING), np.int32(progress.gradient_steps)
-    count, laid = min(CHUNK, _owed(run, state)), None
     if run.config.discrete:
         # Where a generation's steps are parted depends on nothing but their number, so that a
         # resumed run parts them alike.
         count, laid = _minibatches(run, state, key)
+    else:
+        count, laid = min(CHUNK, _owed(run, state)), None
     algorithm, losses = programs.learn(
         state.algorithm,
         state.losses,
@@ -159,12 +160,10 @@ def learn(run: Run, state: RunState) -> RunState:
 def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Layout]:
     """The next gradient steps on episodes: how many, and how their minibatches are laid out."""
     config = run.config
-    most = max(EPISODES_CHUNK, config.n_teams)
-    count = min(most, _owed(run, state))
-    # Room for a usual generation's steps, or for the most: each number would be a program.
-    room = config.n_teams if count <= config.n_teams else most
+    room = max(EPISODES_CHUNK, config.n_teams)
+    count = min(room, _owed(run, state))
     first, shared = np.int32(state.progress.gradient_steps), run.statics["config"]
-    drawn = programs.draw(state.replay, key, first, count=room, config=shared)
+    drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, config=shared)
     places, lengths = (np.asarray(column)[:count] for column in drawn)
     return count, layouts(places, lengths, run.task.spec.episode_limit, room)
 

@@ -13,13 +13,13 @@ from jaxtyping import Int
 from race.replay import Layout
 
 ROWS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32)
-"""Numbers of rows that are used: few, because each is a program."""
+"""Numbers of rows that are used: few, because each is a program, which takes seconds to compile
+and some 2,500 of the 65,530 memory mappings that Linux allows a process."""
 
 
 def rows_for(needed: int) -> int:
-    """The smallest number of rows in use that is large enough."""
-    largest = ROWS[-1]
-    return next((rows for rows in ROWS if rows >= needed), -(-needed // largest) * largest)
+    """The smallest number of rows in use that is large enough; beyond `ROWS` a power of two."""
+    return next((rows for rows in ROWS if rows >= needed), 1 << (needed - 1).bit_length())
 
 
 def bins(lengths: Sequence[int], size: int) -> list[list[int]]:
@@ -52,6 +52,8 @@ def layouts(
 ) -> Layout:
     """The layouts of several minibatches, in as many rows as the fullest of them needs.
 
+    There are never more rows than episodes.
+
     Args:
         places: of the episodes in the buffer.
         lengths: their steps.
@@ -63,7 +65,7 @@ def layouts(
     """
     size = limit + 1
     found = [bins((minibatch + 1).tolist(), size) for minibatch in lengths]
-    rows = rows_for(max(map(len, found)))
+    rows = min(rows_for(max(map(len, found))), places.shape[1])
     shape = (max(room or 0, len(found)), size, rows)
     place, time = np.zeros(shape, np.int32), np.full(shape, -1, np.int32)
     for step, minibatch in enumerate(found):

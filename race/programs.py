@@ -73,18 +73,29 @@ def learn(
     return jax.lax.fori_loop(0, n_steps, body, (state, sums))
 
 
-@partial(jax.jit, static_argnames=("count", "config"))
+@partial(jax.jit, static_argnames=("room", "config"))
 def draw(
-    replay: Replay, key: PRNGKeyArray, first_step: Int[Array, ""], *, count: int, config: Config
-) -> tuple[Int[Array, "count B"], Int[Array, "count B"]]:
-    """The minibatches of episodes of some gradient steps: their places and their lengths."""
+    replay: Replay,
+    key: PRNGKeyArray,
+    first_step: Int[Array, ""],
+    n_steps: Int[Array, ""],
+    *,
+    room: int,
+    config: Config,
+) -> tuple[Int[Array, "room B"], Int[Array, "room B"]]:
+    """The minibatches of episodes of some gradient steps: their places and their lengths.
+
+    The first ``n_steps`` rows are drawn; the others are there for one program to serve every
+    number of steps up to ``room``.
+    """
     TRACES["draw"] += 1
 
-    def one(i: Int[Array, ""]) -> Int[Array, "B"]:
+    def body(i: Int[Array, ""], places: Int[Array, "room B"]) -> Int[Array, "room B"]:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        return distinct_places(replay, config.facmac.batch_size, sample_key)
+        return places.at[i].set(distinct_places(replay, config.facmac.batch_size, sample_key))
 
-    places = jax.lax.map(one, jnp.arange(count, dtype=jnp.int32))
+    places = jnp.zeros((room, config.facmac.batch_size), jnp.int32)
+    places = jax.lax.fori_loop(0, n_steps, body, places)
     return places, replay.data.length[places]
 
 

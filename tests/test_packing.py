@@ -51,7 +51,12 @@ def test_layouts_hold_every_moment_once_in_order(lengths: list[list[int]]) -> No
 def test_rows_are_those_in_use() -> None:
     assert [rows_for(n) for n in ROWS] == list(ROWS)
     assert [rows_for(n) for n in (7, 9, 13, 31)] == [8, 10, 16, 32]
-    assert [rows_for(n) for n in (33, 64, 65)] == [64, 64, 96]
+    assert [rows_for(n) for n in (33, 64, 65)] == [64, 64, 128]
+
+
+def test_never_more_rows_than_episodes() -> None:
+    places = np.arange(7)[None]
+    assert layouts(places, np.full((1, 7), LIMIT), LIMIT).time.shape == (1, LIMIT + 1, 7)
 
 
 @pytest.mark.parametrize("count", [1, 3])
