@@ -1,5 +1,7 @@
 """Errors a user can mend. Each message is one paragraph that says what to do."""
 
+import traceback
+
 
 class RaceError(Exception):
     """Base of every error that is shown to the user as a message, without a traceback."""
@@ -27,3 +29,10 @@ class DivergenceError(RaceError):
 
 class RenderError(RaceError):
     """A video that cannot be made on this machine."""
+
+
+def described(error: Exception) -> str:
+    """Kind and text of somebody else's error, and the file and line that raised it."""
+    frames = traceback.extract_tb(error.__traceback__)
+    place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
+    return f"{type(error).__name__}: {error}{place}"

@@ -122,7 +122,7 @@ def segment_rows(replay: Replay) -> int:
 def from_checkpoint(
     saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm, replay: Replay
 ) -> RunState:
-    """The state that a checkpoint holds; ``replay`` is an empty buffer of the run.
+    """The state that a checkpoint holds; ``replay`` has the shapes of the run's buffer.
 
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.

@@ -9,6 +9,8 @@ wherever it was written, does what the uninterrupted run does.
 import time
 from pathlib import Path
 
+import jax
+
 from race import checkpoints, run_directory
 from race.algorithms import algorithm_of
 from race.clock import Clock
@@ -53,13 +55,14 @@ def train(
     task = make_task(config.task, config.env)
     with run_directory.lock(path):
         rollouts = rollouts_of(config, task)
-        newest, replay = checkpoints.newest(directory.checkpoints), rollouts.empty_replay()
+        newest = checkpoints.newest(directory.checkpoints)
         if newest is None:
-            state = fresh(config, task.spec, algorithm, replay)
+            state = fresh(config, task.spec, algorithm, rollouts.empty_replay())
         else:
+            # An empty buffer beside the full one would take as much memory again.
+            shapes = jax.eval_shape(rollouts.empty_replay)
             saved = checkpoints.load(newest)
-            state = from_checkpoint(saved, config, task.spec, algorithm, replay)
-        del replay
+            state = from_checkpoint(saved, config, task.spec, algorithm, shapes)
         if not _must_go_on(path, config, extend, state.progress):
             run_directory.mark_finished(path)
             return state.progress

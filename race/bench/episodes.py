@@ -16,8 +16,9 @@ from race import programs, run_directory
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best
 from race.config import Algo, Config
+from race.packing import layouts
 from race.presets import resolve
-from race.replay import Layout, Replay
+from race.replay import Replay
 from race.rollouts.episodes import empty_episode
 from race.run_state import Progress
 from race.trainer import train
@@ -73,17 +74,14 @@ def random_episodes(spec: DiscreteSpec, count: int, precision: str) -> Episode:
 class EpisodeUpdates:
     """Runs gradient steps of a fresh learner on some episodes, as training runs them.
 
-    Minibatches are as large as can be: every episode has a row of its own.
+    `random_episodes` are longer than half a row, so that each has a row of its own.
     """
 
     def __init__(self, config: Config, spec: DiscreteSpec, episodes: Episode) -> None:
         algorithm = algorithm_of(config)
         self._statics = {"algorithm": algorithm, "spec": spec, "config": config}
-        rows = config.facmac.batch_size
-        place = np.broadcast_to(np.arange(rows, dtype=np.int32), (spec.episode_limit + 1, rows))
-        time = np.arange(spec.episode_limit + 1, dtype=np.int32)[:, None]
-        time = np.where(time <= episodes.length[:rows], time, np.int32(-1))
-        self._layout = Layout(*(np.repeat(c[None], STEPS, axis=0) for c in (place, time)))
+        places = np.tile(np.arange(config.facmac.batch_size), (STEPS, 1))
+        self._layout = layouts(places, episodes.length[places], spec.episode_limit)
         data = Episode(*map(jnp.asarray, episodes))
         self.replay = Replay(data, jnp.asarray(len(episodes.length), jnp.int32))
         fresh = programs.start(jax.random.key(0), **self._statics)

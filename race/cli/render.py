@@ -83,14 +83,11 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     if chosen.seed >= 2**32:
         raise ConfigError(f"The --seed of a battle must be below {2**32}.")
     from rich.console import Console
-    from rich.progress import Progress
 
     from race.cli.compilation import use_cache
-    from race.cli.progress import rounded
-    from race.envs.micro import make, render
+    from race.envs.micro import make
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
-    from race.rendering import write_video
 
     use_cache()
     console, policy = Console(stderr=True), chosen.policy or "scripted"
@@ -98,17 +95,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
         recording = play(played, POLICIES[policy], chosen.seed, most_steps)
-    with Progress(console=console, transient=True) as bar:
-        drawing = bar.track(
-            render.frames(played, recording),
-            total=render.n_frames(recording),
-            description="drawing",
-        )
-        count = write_video(iter(drawing), out, render.FPS)
-    print(
-        f"{out}: {count} frames, {len(recording.returns)} steps of the {policy} policy, "
-        f"return {rounded(recording.returns[-1])}, {recording.verdict or 'not finished'}"
-    )
+    _write(_recorded(played, recording), f"{policy} policy", out, console)
 
 
 def _render_run(chosen: Render, out: Path) -> None:
@@ -142,7 +129,8 @@ def _render_run(chosen: Render, out: Path) -> None:
         if renderer is None
         else _continuous(chosen, trained, _SECONDS if asked is None else asked, renderer)
     )
-    _write(chosen, trained, drawn, out, console)
+    labels = {"marl": "MARL team", "champion": "champion"}
+    _write(drawn, labels[trained.resolve(chosen.team or "selected")], out, console)
 
 
 class _Drawn(NamedTuple):
@@ -185,7 +173,7 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
     if env is not None:
         steps = len(actions) if seconds == 0 else math.ceil(seconds * STEPS_PER_SECOND)
         return _stepwise(env, actions[:steps], chosen.seed)
-    from race.envs.micro import make, render
+    from race.envs.micro import make
     from race.envs.micro.recording import replay
 
     if seconds > 0:
@@ -193,6 +181,12 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
     with console.status("playing it again"):
         played = make(task.removeprefix("micro/"))
         recording = replay(played, actions, chosen.seed)
+    return _recorded(played, recording)
+
+
+def _recorded(played: Any, recording: Any) -> _Drawn:
+    from race.envs.micro import render
+
     ended = recording.verdict or "not finished"
     return _Drawn(
         render.frames(played, recording),
@@ -223,7 +217,7 @@ def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
     return _Drawn(frames(), len(actions) + 1, fps, lambda: (steps, total, ""))
 
 
-def _write(chosen: Render, trained: Any, drawn: _Drawn, out: Path, console: Any) -> None:
+def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:
     from rich.progress import Progress
 
     from race.cli.progress import rounded
@@ -232,9 +226,8 @@ def _write(chosen: Render, trained: Any, drawn: _Drawn, out: Path, console: Any)
     with Progress(console=console, transient=True) as bar:
         drawing = bar.track(drawn.frames, total=drawn.total, description="drawing")
         count = write_video(iter(drawing), out, drawn.fps)
-    name = {"marl": "MARL team", "champion": "champion"}[trained.resolve(chosen.team or "selected")]
     steps, episode_return, ended = drawn.summary()
     print(
-        f"{out}: {count} frames, {steps} steps of the {name}, "
+        f"{out}: {count} frames, {steps} steps of the {who}, "
         f"return {rounded(episode_return)}" + (f", {ended}" if ended else "")
     )

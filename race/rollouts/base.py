@@ -1,5 +1,6 @@
 """What training asks of rollouts, whatever kind of task they are of."""
 
+import math
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -9,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
+from race.errors import DivergenceError
 from race.replay import Replay
 
 Steps = Callable[[int], None]
@@ -105,3 +107,18 @@ class Rollouts(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None: ...
+
+
+def check_returns(episode_return: Float[Any, "T"], where: str) -> None:
+    """Checks the returns of all teams.
+
+    Raises:
+        DivergenceError: if one is not a finite number.
+    """
+    for team, value in enumerate(np.asarray(episode_return).tolist()):
+        if not math.isfinite(value):
+            raise DivergenceError(
+                f"The return of team {team} in {where} is {value}: the environment gave a reward "
+                "that is not a finite number. A fitness like that never wins, and a buffer that "
+                "holds it teaches nothing, so the run stops here. Look at the task's reward."
+            )

@@ -8,6 +8,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Teams
 from race.exploration import explore, greedy
+from race.learners.facmac import logits
 from race.recurrent import embed_step, no_memory
 from race.types import Observation
 
@@ -46,7 +47,7 @@ def choose(
         how: None if nobody explores.
     """
     z = embed_step(teams.encoder, memory.carry, seen.obs, memory.last_action)
-    scores = jnp.einsum("tnh,tnha->tna", z, teams.heads[:, :, :-1]) + teams.heads[:, :, -1]
+    scores = jax.vmap(logits)(z, teams.heads)
     action = greedy(scores, seen.avail_actions)
     if how is not None:
         key = jax.random.fold_in(how.key, tick)

@@ -1,6 +1,5 @@
 """Rollouts of tasks with discrete actions: whole episodes, on the device where that can be."""
 
-import math
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, final
@@ -19,7 +18,7 @@ from race.exploration import epsilon
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay import Replay, init_replay
 from race.rollouts import device
-from race.rollouts.base import Generation, Score, Steps
+from race.rollouts.base import Generation, Score, Steps, check_returns
 from race.rollouts.choosing import Exploration
 from race.rollouts.episodes import Played, empty_episode
 from race.rollouts.host_episodes import HostEnvs
@@ -140,15 +139,7 @@ class EpisodeRollouts:
         return device.play(self._env, teams, small, how, self._spec, precision)
 
     def _check_finite(self, played: Played, where: str) -> None:
-        returns = np.asarray(played.episode_return).tolist()
-        for team, value in enumerate(returns):
-            if not math.isfinite(value):
-                raise DivergenceError(
-                    f"The return of team {team} in {where} is {value}: the environment gave a "
-                    "reward that is not a finite number. A fitness like that never wins, and a "
-                    "buffer that holds it teaches nothing, so the run stops here. Look at the "
-                    "task's reward."
-                )
+        check_returns(played.episode_return, where)
         if not programs.all_finite((played.episodes.obs, played.episodes.state)):
             raise DivergenceError(
                 f"The environment gave an observation or a state in {where} that is not a finite "

@@ -5,7 +5,6 @@ import multiprocessing
 import os
 import signal
 import time
-import traceback
 import warnings
 from collections.abc import Callable
 from types import TracebackType
@@ -15,7 +14,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from race.errors import DivergenceError, TaskError
+from race.errors import DivergenceError, TaskError, described
 from race.types import EnvSpec, Rollout, Task, Transition
 
 Act = Callable[[NDArray[np.float32], int], Any]
@@ -148,11 +147,9 @@ class EnvPool:
 
     def _failed(self, error: Exception, what: str, team: int | None) -> TaskError:
         which = f" (environment {team})" if team is not None else ""
-        frames = traceback.extract_tb(error.__traceback__)
-        place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
         return TaskError(
             f"The environment of {self.spec.task} failed in its {what}{which}: "
-            f"{type(error).__name__}: {error}{place}. Its states must have "
+            f"{described(error)}. Its states must have "
             f"{self.spec.state_size} entries, its rewards be numbers."
         )
 

@@ -1,6 +1,5 @@
 """Episodes of tasks with discrete actions on the host, such as the real StarcraftII."""
 
-import traceback
 from functools import partial
 from types import TracebackType
 from typing import Any, final
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
-from race.errors import TaskError
+from race.errors import TaskError, described
 from race.rollouts.choosing import Exploration, blank, choose
 from race.rollouts.episodes import Played, empty_episode
 from race.types import DiscreteTask, Observation
@@ -133,11 +132,8 @@ class HostEnvs:
         return outcome
 
     def _failed(self, error: Exception, what: str) -> TaskError:
-        frames = traceback.extract_tb(error.__traceback__)
-        place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
         return TaskError(
-            f"The environment of {self.task.spec.task} failed ({what}): "
-            f"{type(error).__name__}: {error}{place}."
+            f"The environment of {self.task.spec.task} failed ({what}): {described(error)}."
         )
 
 

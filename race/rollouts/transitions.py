@@ -1,7 +1,6 @@
 """Rollouts of tasks with continuous actions: transitions from environments on the host."""
 
 import contextlib
-import math
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, final
@@ -17,7 +16,7 @@ from race.config import Config
 from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds
 from race.replay import Replay, init_replay
-from race.rollouts.base import Generation, Score, Steps
+from race.rollouts.base import Generation, Score, Steps, check_returns
 from race.rollouts.host import EnvPool, collect
 from race.types import EnvSpec, Rollout, Task, Transition
 
@@ -165,10 +164,4 @@ def _check_finite(rollout: Rollout, where: str) -> None:
             f"The environment gave a state that is not a finite number in {where}. A buffer that "
             "holds it teaches nothing, so the run stops here. Look at the task's observation."
         )
-    for team, value in enumerate(rollout.episode_return.tolist()):
-        if not math.isfinite(value):
-            raise DivergenceError(
-                f"The return of team {team} in {where} is {value}: the environment gave a reward "
-                "that is not a finite number. A fitness like that never wins, and a buffer that "
-                "holds it teaches nothing, so the run stops here. Look at the task's reward."
-            )
+    check_returns(rollout.episode_return, where)

@@ -1,6 +1,7 @@
 """Battles played from start to end with every game loop kept, for pictures of them."""
 
 import functools
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -25,6 +26,10 @@ class Recording(NamedTuple):
     """Sum of the rewards after each step."""
     verdict: str
     """``won``, ``lost``, ``draw`` or ``time``; empty if the battle was not played to its end."""
+
+
+Turn = tuple[Timestep, Units]
+"""A step, and the units after each of its game loops."""
 
 
 def step_and_film(
@@ -56,21 +61,19 @@ def play(played: Battle, policy: Policy, seed: int, most_steps: int | None = Non
     """
     start, key = jax.random.split(jax.random.key(seed))
     env_state, observation = played.reset(start)
-    films = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], env_state.units)]
-    rewards: list[float] = []
-    verdict = ""
     limit = played.spec.episode_limit
-    for _ in range(limit if most_steps is None else min(most_steps, limit)):
-        key, now = jax.random.split(key)
-        env_state, timestep, film = _play_step(policy, played.scenario, env_state, observation, now)
-        observation = timestep.observation
-        films.append(jax.tree.map(np.asarray, film))
-        rewards.append(float(timestep.reward))
-        if timestep.terminated:
-            verdict = verdict_of(played.scenario, timestep.info)
-            break
-    units = jax.tree.map(lambda *leaves: np.concatenate(leaves), *films)
-    return Recording(units, np.cumsum(np.array(rewards, np.float64)), verdict)
+    steps = limit if most_steps is None else min(most_steps, limit)
+
+    def turns(env_state: EnvState, observation: Observation, key: Key[Array, ""]) -> Iterator[Turn]:
+        for _ in range(steps):
+            key, now = jax.random.split(key)
+            env_state, timestep, film = _play_step(
+                policy, played.scenario, env_state, observation, now
+            )
+            observation = timestep.observation
+            yield timestep, film
+
+    return _record(played.scenario, env_state.units, turns(env_state, observation, key))
 
 
 def replay(played: Battle, actions: Int[Any, "steps n"], seed: int) -> Recording:
@@ -83,16 +86,26 @@ def replay(played: Battle, actions: Int[Any, "steps n"], seed: int) -> Recording
     """
     key, now = jax.random.split(jax.random.key(seed))
     env_state, _ = played.reset(now)
-    films = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], env_state.units)]
+
+    def turns(env_state: EnvState, key: Key[Array, ""]) -> Iterator[Turn]:
+        for chosen in actions:
+            key, now = jax.random.split(key)
+            env_state, timestep, film = _film(played.scenario, env_state, jnp.asarray(chosen), now)
+            yield timestep, film
+
+    return _record(played.scenario, env_state.units, turns(env_state, key))
+
+
+def _record(scenario: Scenario, units: Units, turns: Iterator[Turn]) -> Recording:
+    """What the turns of a battle bring, up to its end if they reach it."""
+    films = [jax.tree.map(lambda leaf: np.asarray(leaf)[None], units)]
     rewards: list[float] = []
     verdict = ""
-    for chosen in actions:
-        key, now = jax.random.split(key)
-        env_state, timestep, film = _film(played.scenario, env_state, jnp.asarray(chosen), now)
+    for timestep, film in turns:
         films.append(jax.tree.map(np.asarray, film))
         rewards.append(float(timestep.reward))
         if timestep.terminated:
-            verdict = verdict_of(played.scenario, timestep.info)
+            verdict = verdict_of(scenario, timestep.info)
             break
     units = jax.tree.map(lambda *leaves: np.concatenate(leaves), *films)
     return Recording(units, np.cumsum(np.array(rewards, np.float64)), verdict)
