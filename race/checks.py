@@ -133,7 +133,7 @@ def check(config: Config) -> None:
             "race.population-size",
             race.population_size,
             "at least 4: an elite, a second parent, a team for their offspring and one for the "
-            "injected MARL team (for no population use --algo matd3)",
+            f"injected MARL team (for no population use --algo {config.base})",
         ),
         (
             0 <= race.mutation_fraction <= 1,

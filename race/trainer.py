@@ -23,7 +23,7 @@ from race.metrics import MetricsWriter
 from race.rollouts import rollouts_of
 from race.run import Report, Run, save, silent
 from race.run_directory import RunDirectory
-from race.run_state import Progress, RunState, fresh, from_checkpoint
+from race.run_state import Progress, RunState, fresh, from_checkpoint, progress_of
 
 
 def train(
@@ -54,8 +54,12 @@ def train(
     report("preparing the task", Progress(), {})
     task = make_task(config.task, config.env)
     with run_directory.lock(path):
-        rollouts = rollouts_of(config, task)
         newest = checkpoints.newest(directory.checkpoints)
+        made = Progress() if newest is None else progress_of(checkpoints.load(newest, tables=False))
+        if not _must_go_on(path, config, extend, made):
+            run_directory.mark_finished(path)
+            return made
+        rollouts = rollouts_of(config, task)
         if newest is None:
             state = fresh(config, task.spec, algorithm, rollouts.empty_replay())
         else:
@@ -63,9 +67,7 @@ def train(
             shapes = jax.eval_shape(rollouts.empty_replay)
             saved = checkpoints.load(newest)
             state = from_checkpoint(saved, config, task.spec, algorithm, shapes)
-        if not _must_go_on(path, config, extend, state.progress):
-            run_directory.mark_finished(path)
-            return state.progress
+            del saved  # its buffer too
         with (
             rollouts,
             MetricsWriter(directory.metrics, state.progress.metrics_offset) as metrics,

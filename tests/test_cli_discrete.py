@@ -16,6 +16,7 @@ from race.cli import main
 from race.envs import micro
 from race.envs.discrete_probe.host import ProbeHost
 from race.envs.pymarl import pymarl_task
+from race.errors import ConfigError, TaskError
 from race.rollouts.discrete import EpisodeRollouts
 from race.trained import load_trained
 from race.types import DiscreteTask
@@ -61,6 +62,10 @@ class Drawn:
 
 def drawn() -> DiscreteTask:
     return pymarl_task(Drawn, DRAWN)
+
+
+def without_a_game() -> DiscreteTask:
+    return pymarl_task(functools.partial(open, "no game here"), "absent")
 
 
 def race(command: str) -> None:
@@ -189,6 +194,15 @@ def test_a_finished_run_is_extended(run_of: Any, capsys: pytest.CaptureFixture[s
     assert after[-1]["env_steps"] >= 40
 
 
+def test_fewer_steps_than_were_made_are_refused(
+    run_of: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = run_of("facmac", DRAWN, 10)
+    capsys.readouterr()
+    # The buffer of a run of so few steps would be too small for what the run holds.
+    assert "--env-steps 1 would not extend it" in fails(f"resume {path} --env-steps 1", capsys)
+
+
 # Pictures.
 
 
@@ -287,6 +301,42 @@ def test_a_champion_cannot_be_drawn_without_a_population(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_environment_that_fails_while_it_is_drawn(
+    run_of: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = run_of("facmac", DRAWN, 10)
+
+    def render(self: Drawn, mode: str) -> Any:
+        raise OSError("the display is gone")
+
+    monkeypatch.setattr(Drawn, "render", render)
+    capsys.readouterr()
+    message = fails(f"render {path} --out own.gif", capsys)
+    assert "failed while it was drawn: OSError: the display is gone, in" in message
+
+
+def test_a_trained_team_plays_in_python(run_of: Any) -> None:
+    path = run_of("facmac", DRAWN, 10)
+    trained = load_trained(path)
+    with EpisodeRollouts(trained.config, trained.task) as rollouts:
+        head = trained.heads["marl"]
+        expected = [rollouts.episode(trained.encoder, head, seed) for seed in (3, 4, 5)]
+    policy = trained.recurrent_policy("selected")
+    env = trained.task.make(None)
+    for seed, actions in zip((3, 4, 5), expected, strict=True):
+        policy.reset()
+        seen, _ = env.reset(seed=seed)
+        for step, joint in enumerate(actions):
+            chosen = policy(seen["obs"], seen["avail_actions"])
+            np.testing.assert_array_equal(chosen, joint)
+            seen, _, terminated, truncated, _ = env.step(chosen)
+            assert (terminated or truncated) == (step == len(actions) - 1)
+    with pytest.raises(TaskError, match=r"obs of .* has the shape"):
+        policy(seen["obs"][:1], seen["avail_actions"])
+    with pytest.raises(ConfigError, match="recurrent_policy"):
+        trained.policy("marl")
+
+
 # Settings.
 
 OUT_OF_RANGE = {
@@ -337,6 +387,13 @@ def test_every_setting_of_facmac_is_tried() -> None:
         ("train probe/matching --base matd3", "RACE(MATD3) does not work on probe/matching"),
         ("train probe/matchin", "probe/matching"),
         ("train micro/3s_vs_4z", "nearest names are 3s_vs_3z"),
+        (
+            "train test_cli_discrete:without_a_game",
+            "without_a_game failed: FileNotFoundError: [Errno 2] No such file or directory: "
+            "'no game here'",
+        ),
+        ("train probe/matching --race.population-size 3", "for no population use --algo facmac"),
+        ("train probe/matching --env.agent-obsk 1", "--env.agent-obsk would have no effect"),
         ("train probe/matching --preset td3", "--preset td3 has no effect on probe/matching"),
         (
             "train probe/matching --learner.batch-size 8 --learner.discount 0.9",

@@ -62,6 +62,9 @@ def test_commands_in_documents_run(
     for line in shown(document):
         words = shlex.split(line)
         main(small(words[words.index("race") + 1 :]))
+    for example in re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL):
+        if "load_trained" in example:  # it reads a run of these commands
+            exec(example, {})
 
 
 def test_modules_called_in_documents_run(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,5 +1,6 @@
 """``race render``."""
 
+import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from race.config import TeamName
-from race.errors import ConfigError, RenderError
+from race.errors import ConfigError, RaceError, RenderError, described
 
 PolicyName = Literal["scripted", "random"]
 _SECONDS = 15.0
@@ -148,7 +149,7 @@ def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> 
     policy = trained.policy(chosen.team or "selected")
     episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
     return _Drawn(
-        episode.frames(),
+        _guarded(episode.frames()),
         episode.n_frames,
         episode.fps,
         lambda: (episode.steps, episode.episode_return, ""),
@@ -164,7 +165,8 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
         raise ConfigError(f"The --seed of an episode must be below {2**31}.")
     head = trained.heads[trained.resolve(chosen.team or "selected")]
     # Without somebody to draw, there is nothing to play either.
-    env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
+    with _theirs("when it was made for pictures"):
+        env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
     with (
         console.status("playing the episode"),
         EpisodeRollouts(trained.config, trained.task) as rollouts,
@@ -214,7 +216,23 @@ def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
             env.close()
 
     fps = float(env.metadata.get("render_fps") or STEPS_PER_SECOND)
-    return _Drawn(frames(), len(actions) + 1, fps, lambda: (steps, total, ""))
+    return _Drawn(_guarded(frames()), len(actions) + 1, fps, lambda: (steps, total, ""))
+
+
+def _guarded(frames: Iterator[Any]) -> Iterator[Any]:
+    with _theirs("while it was drawn"):
+        yield from frames
+
+
+@contextlib.contextmanager
+def _theirs(when: str) -> Iterator[None]:
+    """Mistakes of an environment that is not our own are told as such."""
+    try:
+        yield
+    except RaceError:
+        raise
+    except Exception as error:
+        raise RenderError(f"The environment failed {when}: {described(error)}.") from error
 
 
 def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:

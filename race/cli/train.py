@@ -90,7 +90,7 @@ def _parse(arguments: list[str]) -> Train:
 
 
 def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> None:
-    """Settings of a learner that would not be used are mistakes, and costly ones if not told."""
+    """Settings that would not be used are mistakes, and costly ones if not told."""
     kind = "discrete" if discrete else "continuous"
     if discrete and preset != "paper":
         raise ConfigError(
@@ -100,6 +100,8 @@ def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> Non
         )
     if discrete:
         unused = _changed("learner", asked.learner, LearnerConfig())
+        if ":" not in asked.task:  # a task of the user's own is given these settings
+            unused += _changed("env", asked.env, EnvConfig())
         instead = "--facmac.*"
     else:
         # The mixer is all that FACMAC shares with its form for continuous actions.
@@ -109,8 +111,8 @@ def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> Non
         instead = "--learner.*"
     if unused:
         raise ConfigError(
-            f"{' and '.join(unused)} would have no effect on {asked.task}: its actions are {kind}, "
-            f"and the settings of its learner are {instead}. Leave out what has no effect."
+            f"{' and '.join(unused)} would have no effect on {asked.task}. Its actions are {kind}; "
+            f"the settings of its learner are {instead}. Leave out what has no effect."
         )
 
 

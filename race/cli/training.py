@@ -47,9 +47,11 @@ def run(path: Path, config: Config, *, extend: bool = False) -> None:
     with TrainingDisplay(config, console) as display:
         progress = train(path, config, extend=extend, report=display.report, began=began)
     if not is_over(config, progress):
+        kept = f"and saved at {progress.env_steps:,} environment steps. Go on"
+        if progress.env_steps == 0:
+            kept = "before there was anything to save. Begin again"
         console.print(
-            f"Interrupted and saved at {progress.env_steps:,} environment steps. "
-            f"Go on with: race resume {path}",
+            f"Interrupted {kept} with: race resume {path}",
             highlight=False,
             soft_wrap=True,
         )

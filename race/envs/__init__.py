@@ -15,7 +15,7 @@ import numpy as np
 
 from race.config import EnvConfig
 from race.envs import discrete_probe, mamujoco, probe
-from race.errors import TaskError
+from race.errors import RaceError, TaskError, described
 from race.types import AnyTask, DiscreteTask, EnvSpec, Task
 
 __all__ = [
@@ -193,7 +193,12 @@ def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
         and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         for parameter in inspect.signature(function).parameters.values()
     )
-    task = function(config) if required else function()
+    try:
+        task = function(config) if required else function()
+    except RaceError:
+        raise
+    except Exception as error:
+        raise TaskError(f"Task {task_id}: {function_name} failed: {described(error)}.") from error
     if not isinstance(task, Task | DiscreteTask):
         raise TaskError(
             f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "
@@ -265,6 +270,6 @@ def _flat_box(space: Any, what: str, task: str) -> gymnasium.spaces.Box:
         return space
     raise TaskError(
         f"Task {task}: the {what} space must be a Box with one axis, and it is {space}. "
-        "gymnasium.wrappers.FlattenObservation flattens observations; discrete actions are not "
-        "supported."
+        "gymnasium.wrappers.FlattenObservation flattens observations; a task with discrete actions "
+        "is a race.types.DiscreteTask, which race.envs.pymarl.pymarl_task makes."
     )

@@ -253,6 +253,11 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             "state": self._array("get_state", env.get_state(), (spec.state_size,)),
         }
         available = self._array("get_avail_actions", env.get_avail_actions(), (n, spec.n_actions))
+        if not np.isin(available, (0.0, 1.0)).all():
+            raise TaskError(
+                f"Task {spec.task}: get_avail_actions must say 1 or 0 of every action, available "
+                f"or not; after {self._steps} steps it returned {available.tolist()}."
+            )
         idle = np.flatnonzero(~available.any(axis=1))
         if len(idle):
             raise TaskError(
@@ -260,7 +265,7 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
                 f"{self._steps} steps. Give it one that does nothing, also when it is dead and "
                 "after the last step."
             )
-        self._available = (available != 0).astype(np.int8)
+        self._available = available.astype(np.int8)
         return observation | {"avail_actions": self._available.copy()}
 
     def _array(self, method: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:

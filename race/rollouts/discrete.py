@@ -140,9 +140,22 @@ class EpisodeRollouts:
 
     def _check_finite(self, played: Played, where: str) -> None:
         check_returns(played.episode_return, where)
-        if not programs.all_finite((played.episodes.obs, played.episodes.state)):
-            raise DivergenceError(
-                f"The environment gave an observation or a state in {where} that is not a finite "
-                "number, or is too large for the replay buffer, which keeps numbers up to 65504 "
-                "with --facmac.replay-precision float16 and all with float32."
-            )
+        shown = {"an observation": played.episodes.obs, "a state": played.episodes.state}
+        if programs.all_finite(shown):
+            return
+        for name, column in shown.items():
+            values = np.asarray(column)
+            strange = np.argwhere(~np.isfinite(values))
+            if len(strange):
+                team, step = strange[0][:2]
+                raise DivergenceError(
+                    f"The environment of team {team} gave {name} in {where}, after {step} steps, "
+                    f"with the entry {values[tuple(strange[0])]}. "
+                    + (
+                        "That is no number. Look at the task."
+                        if np.isnan(values[tuple(strange[0])])
+                        else "The replay buffer keeps numbers up to 65504 with "
+                        "--facmac.replay-precision float16, larger ones with float32; better "
+                        "scale what the task shows to about 1."
+                    )
+                )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
-from race.errors import TaskError, described
+from race.errors import RaceError, TaskError, described
 from race.rollouts.choosing import Exploration, blank, choose
 from race.rollouts.episodes import Played, empty_episode
 from race.types import DiscreteTask, Observation
@@ -48,12 +48,15 @@ class HostEnvs:
             As numpy arrays.
 
         Raises:
-            TaskError: if an environment fails or shows something of another shape.
+            TaskError: if an environment fails, shows something of another shape, or offers an
+                agent no action.
         """
         spec, count = self.task.spec, len(seeds)
         while len(self._envs) < count:
             try:
                 self._envs.append(self.task.make(None))
+            except RaceError:
+                raise
             except Exception as error:
                 raise self._failed(error, f"making of environment {len(self._envs)}") from error
         episodes = empty_episode(spec, precision, count)
@@ -76,7 +79,7 @@ class HostEnvs:
             memory, chosen = _choose(teams, memory, shown, np.int32(tick), how)
             actions = np.asarray(chosen)
             for team in tuple(running):
-                reward, terminated, truncated, info = self._see(
+                reward, terminated, truncated, battle_won = self._see(
                     seen, team, partial(self._step, actions[team])
                 )
                 episodes.action[team, tick] = actions[team]
@@ -85,7 +88,7 @@ class HostEnvs:
                 episodes.length[team] = tick + 1
                 _write(episodes, seen, team, tick + 1)
                 returns[team] += np.float32(reward)
-                won[team] |= bool(info.get("battle_won", False))
+                won[team] |= battle_won
                 if terminated or truncated:
                     running.remove(team)
         return Played(episodes, returns, won)
@@ -114,7 +117,8 @@ class HostEnvs:
     @staticmethod
     def _step(action: NDArray[np.int32], env: gymnasium.Env[Any, Any]) -> tuple[Any, Any]:
         observation, reward, terminated, truncated, info = env.step(action)
-        return observation, (float(reward), bool(terminated), bool(truncated), info)
+        battle_won = bool(info.get("battle_won", False))
+        return observation, (float(reward), bool(terminated), bool(truncated), battle_won)
 
     def _see(self, seen: Observation, team: int, move: Any) -> Any:
         """Makes a move in a team's environment and writes down what it shows."""
@@ -123,12 +127,21 @@ class HostEnvs:
             for name, column in seen._asdict().items():
                 value = np.asarray(observation[name])
                 if value.shape != column.shape[1:]:
-                    raise ValueError(
-                        f"its {name} has the shape {value.shape} instead of {column.shape[1:]}"
+                    raise TaskError(
+                        f"The environment of {self.task.spec.task} shows {name} of the shape "
+                        f"{value.shape}; its DiscreteSpec says {column.shape[1:]}."
                     )
                 column[team] = value
+        except RaceError:  # such as those of race.envs.pymarl, which name the task and the mistake
+            raise
         except Exception as error:
             raise self._failed(error, f"environment {team}") from error
+        idle = np.flatnonzero(~seen.avail_actions[team].any(axis=1))
+        if len(idle):
+            raise TaskError(
+                f"The environment of {self.task.spec.task} offers agent {idle[0]} no action. Give "
+                "every agent one that does nothing, also when it is dead and after the last step."
+            )
         return outcome
 
     def _failed(self, error: Exception, what: str) -> TaskError:
@@ -138,6 +151,7 @@ class HostEnvs:
 
 
 def _write(episodes: Any, seen: Observation, team: int, place: int) -> None:
-    episodes.obs[team, place] = seen.obs[team]
-    episodes.state[team, place] = seen.state[team]
+    with np.errstate(over="ignore"):  # what half precision cannot hold is found and told later
+        episodes.obs[team, place] = seen.obs[team]
+        episodes.state[team, place] = seen.state[team]
     episodes.avail_actions[team, place] = seen.avail_actions[team]

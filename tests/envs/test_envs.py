@@ -72,7 +72,7 @@ def test_every_kind_of_task_is_made_and_the_narrow_maker_refuses_discrete_ones()
 
 
 def test_the_documents_example_works(directory):
-    example, _ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    example, *_ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     write(directory, "my_task.py", example)
     task = make_task("my_task:task")
     assert task.spec.obs_index == ((0, 2), (1, 3))
@@ -86,7 +86,7 @@ def test_the_documents_example_works(directory):
 
 
 def test_the_documents_discrete_example_works(directory):
-    _, example = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    _, example, _ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     write(directory, "my_battle.py", example)
     task = make_task("my_battle:task")
     assert isinstance(task, DiscreteTask)

@@ -267,6 +267,8 @@ def test_get_env_info_that_is_no_dictionary() -> None:
         ("get_state", [{}], "get_state returned what is no array"),
         ("get_avail_actions", [[1, 1, 1]], r"get_avail_actions returned shape \(1, 3\)"),
         ("get_avail_actions", [[1, 0, 0], [0, 0, 0]], "no action is available to agent 1"),
+        ("get_avail_actions", [[1, 0, 0], [1, float("nan"), 0]], "must say 1 or 0 of every action"),
+        ("get_avail_actions", [[1, 0, 0], [2, 0, 0]], "must say 1 or 0 of every action"),
     ],
 )
 def test_what_is_shown_must_fit(method: str, answer: Any, told: str) -> None:

@@ -145,7 +145,8 @@ class Countdown(gymnasium.Env[Any, Any]):
             raise OSError("the game is gone")
         over, even = self.steps == self.length, self.length % 2 == 0
         reward = float("nan") if self.failure == "reward" else 0.5 + self.steps
-        return self._look(), reward, over and even, over and not even, {}
+        info: Any = None if self.failure == "info" else {}
+        return self._look(), reward, over and even, over and not even, info
 
     def close(self) -> None:
         self.closed = True
@@ -159,6 +160,12 @@ class Countdown(gymnasium.Env[Any, Any]):
             "state": shown[:1] if self.failure == "shape" else shown,
             "avail_actions": np.ones((2, 3), np.int8),
         }
+        if self.failure == "idle" and self.steps == 1:
+            seen["avail_actions"][1] = 0
+        if self.failure == "nan":
+            seen["obs"][1, 0] = np.nan
+        if self.failure == "told":
+            raise TaskError("What to do about it.")
         if self.failure == "key":
             del seen["state"]
         return seen
@@ -498,10 +505,16 @@ def test_the_program_is_traced_once_for_all_that_has_its_shape() -> None:
 @pytest.mark.parametrize(
     ("failure", "told"),
     [
-        ("reset", "OSError: no game here"),
-        ("step", "OSError: the game is gone"),
-        ("shape", r"ValueError: its state has the shape \(1,\) instead of \(2,\)"),
-        ("key", "KeyError: 'state'"),
+        ("reset", r"countdown failed \(environment \d\): OSError: no game here, in .*, line \d+"),
+        (
+            "step",
+            r"countdown failed \(environment \d\): OSError: the game is gone, in .*, line",
+        ),
+        ("info", r"countdown failed \(environment \d\): AttributeError: 'NoneType' .*'get'"),
+        ("shape", r"countdown shows state of the shape \(1,\); its DiscreteSpec says \(2,\)"),
+        ("key", r"countdown failed \(environment \d\): KeyError: 'state'"),
+        ("idle", "countdown offers agent 1 no action"),
+        ("told", "^What to do about it.$"),
     ],
 )
 def test_an_environment_that_fails_names_its_task(
@@ -510,7 +523,7 @@ def test_an_environment_that_fails_names_its_task(
     task = broken(failure)
     with (
         EpisodeRollouts(config_of("countdown"), task) as rollouts,
-        pytest.raises(TaskError, match=rf"countdown failed \(environment \d\): {told}.*, line \d+"),
+        pytest.raises(TaskError, match=told),
     ):
         rollouts.play(teams_of(task.spec, 5), 0, 0, rollouts.empty_replay())
     assert made
@@ -526,7 +539,15 @@ def test_rewards_that_are_not_finite_are_refused(made: list[Countdown]) -> None:
         rollouts.play(teams_of(task.spec, 5), 7, 0, rollouts.empty_replay())
 
 
-@pytest.mark.filterwarnings("ignore:overflow encountered in cast")
+def test_observations_that_are_no_numbers_are_refused(made: list[Countdown]) -> None:
+    told = "gave an observation in generation 8, after 0 steps, with the entry nan. That is no num"
+    with (
+        EpisodeRollouts(config_of("countdown"), broken("nan")) as rollouts,
+        pytest.raises(DivergenceError, match=told),
+    ):
+        rollouts.play(teams_of(COUNTDOWN.spec, 5), 7, 0, rollouts.empty_replay())
+
+
 def test_observations_too_large_for_the_buffer_are_refused(made: list[Countdown]) -> None:
     task = broken("large")
     for precision, fits in (("float16", False), ("float32", True)):
