@@ -108,12 +108,13 @@ def plot(
                 continue  # a quantity of populations, asked for of several methods
             curve = _curve(path, rows, key, metric)
             curves.setdefault(config.task, {}).setdefault((method, name), []).append(curve)
-    figure = Figure(figsize=(6.4 * min(len(curves), 3), 4.4 * math.ceil(len(curves) / 3)))
+    columns = 2 if len(curves) == 4 else min(len(curves), 3)
+    rows_of_panels = math.ceil(len(curves) / columns)
+    figure = Figure(figsize=(6.4 * columns, 4.4 * rows_of_panels))
     FigureCanvasAgg(figure)
     found = []
-    columns = min(len(curves), 3)
     for index, (task, methods) in enumerate(sorted(curves.items())):
-        axes = figure.add_subplot(math.ceil(len(curves) / 3), columns, index + 1)
+        axes = figure.add_subplot(rows_of_panels, columns, index + 1)
         found += _panel(axes, task, methods, metric)
     figure.tight_layout()
     try:
