@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from commands import fails, race
 
 from race import checkpoints, metrics, run_directory
-from race.cli import COMMANDS, main
+from race.cli import COMMANDS
 from race.cli.progress import TrainingDisplay
 from race.config import Config
 
@@ -21,10 +22,6 @@ SMALL = (
     "--race.policy-embedding-size 4 --race.mine-size 6 --evaluation.every 60 "
     "--evaluation.episodes 2"
 )
-
-
-def race(command: str) -> None:
-    main(command.split())
 
 
 @pytest.fixture(scope="module")
@@ -38,16 +35,6 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run(trained: Path, tmp_path: Path) -> Path:
     """A finished run that a test may damage."""
     return Path(shutil.copytree(trained, tmp_path / "run"))
-
-
-def fails(command: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Runs a command that must fail with a message; returns it."""
-    with pytest.raises(SystemExit) as stopped:
-        race(command)
-    assert stopped.value.code in (1, 2)
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    return " ".join(error.split())
 
 
 def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:

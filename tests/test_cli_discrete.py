@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import imageio.v3 as imageio
 import numpy as np
 import pytest
+from commands import fails, race
 from PIL import Image, ImageSequence
 
 from race import metrics
-from race.cli import main
 from race.envs import micro
 from race.envs.discrete_probe.host import ProbeHost
 from race.envs.pymarl import pymarl_task
@@ -66,20 +66,6 @@ def drawn() -> DiscreteTask:
 
 def without_a_game() -> DiscreteTask:
     return pymarl_task(functools.partial(open, "no game here"), "absent")
-
-
-def race(command: str) -> None:
-    main(command.split())
-
-
-def fails(command: str, capsys: pytest.CaptureFixture[str]) -> str:
-    """Runs a command that must fail with a message; returns it."""
-    with pytest.raises(SystemExit) as stopped:
-        race(command)
-    assert stopped.value.code in (1, 2)
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    return " ".join(error.split())
 
 
 @pytest.fixture(scope="module")

@@ -13,22 +13,16 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from whole_runs import KilledError, rows, run
 
-from race import checkpoints, generation, metrics, programs, run_directory, trainer
+from race import checkpoints, generation, programs, trainer
 from race.config import CheckpointConfig, Config, EvaluationConfig, LearnerConfig, RaceConfig
 from race.envs import factorised
 from race.errors import DivergenceError
 from race.presets import resolve
-from race.run import Report, silent
 from race.run_state import Progress
 from race.trainer import train
 from race.types import Task
-
-TIMES = ("wall_seconds", "time/env_steps_per_second", "time/rollout_fraction")
-
-
-class KilledError(Exception):
-    """Stands for the end of a process at a certain moment."""
 
 
 def small(task: str = "probe/terminates", **changes: Any) -> Config:
@@ -42,18 +36,6 @@ def small(task: str = "probe/terminates", **changes: Any) -> Config:
         checkpoint=CheckpointConfig(minutes=0.0, keep=2),
     )
     return resolve(dataclasses.replace(config, **changes))
-
-
-def rows(path: Path) -> list[dict[str, Any]]:
-    """The rows of a run without wall-clock times."""
-    found = metrics.read(path / "metrics.jsonl")
-    return [{k: v for k, v in row.items() if k not in TIMES} for row in found]
-
-
-def run(path: Path, config: Config, report: Report = silent) -> Progress:
-    if not (path / "config.json").exists():
-        run_directory.create(path, config)
-    return train(path, config, report=report)
 
 
 @pytest.fixture(autouse=True)

@@ -12,8 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from whole_runs import KilledError, rows, run
 
-from race import checkpoints, generation, metrics, programs, run_directory
+from race import checkpoints, generation, programs, run_directory
 from race.cli import main
 from race.config import CheckpointConfig, Config, EvaluationConfig, FacmacConfig, RaceConfig
 from race.envs.discrete_probe import PROBES
@@ -22,19 +23,13 @@ from race.envs.pymarl import pymarl_task
 from race.presets import resolve
 from race.replay import distinct_places
 from race.rollouts.discrete import EpisodeRollouts
-from race.run import Report, silent
+from race.run import Report
 from race.run_state import Progress
-from race.trainer import train
 from race.types import DiscreteTask
 
-TIMES = ("wall_seconds", "time/env_steps_per_second", "time/rollout_fraction")
 TEAMS = 5
 ON_HOST = "test_trainer_discrete:lives_on_host"
 UNEQUAL = "test_trainer_discrete:of_unequal_lengths"
-
-
-class KilledError(Exception):
-    """Stands for the end of a process at a certain moment."""
 
 
 def lives_on_host() -> DiscreteTask:
@@ -101,13 +96,6 @@ def small(
     return resolve(dataclasses.replace(config, **changes), discrete=True)
 
 
-def rows(path: Path, kind: str = "") -> list[dict[str, Any]]:
-    """The rows of a run without wall-clock times."""
-    found = metrics.read(path / "metrics.jsonl")
-    timeless = [{k: v for k, v in row.items() if k not in TIMES} for row in found]
-    return [row for row in timeless if kind in ("", row["kind"])]
-
-
 def final(path: Path) -> Any:
     """All that the newest checkpoint of a run holds, without times."""
     newest = checkpoints.newest(path / "checkpoints")
@@ -129,12 +117,6 @@ def assert_same(one: Any, other: Any) -> None:
         for name in mine:
             np.testing.assert_array_equal(mine[name], theirs[name], err_msg=name, strict=True)
     assert one[2:] == other[2:]
-
-
-def run(path: Path, config: Config, report: Report = silent) -> Progress:
-    if not (path / "config.json").exists():
-        run_directory.create(path, config)
-    return train(path, config, report=report)
 
 
 @pytest.fixture(autouse=True)

@@ -1,0 +1,29 @@
+"""Whole runs in a directory, and what they wrote."""
+
+from pathlib import Path
+from typing import Any
+
+from race import metrics, run_directory
+from race.config import Config
+from race.run import Report, silent
+from race.run_state import Progress
+from race.trainer import train
+
+TIMES = ("wall_seconds", "time/env_steps_per_second", "time/rollout_fraction")
+
+
+class KilledError(Exception):
+    """Stands for the end of a process at a certain moment."""
+
+
+def rows(path: Path, kind: str = "") -> list[dict[str, Any]]:
+    """The rows of a run, or those of a kind, without wall-clock times."""
+    found = metrics.read(path / "metrics.jsonl")
+    timeless = [{k: v for k, v in row.items() if k not in TIMES} for row in found]
+    return [row for row in timeless if kind in ("", row["kind"])]
+
+
+def run(path: Path, config: Config, report: Report = silent) -> Progress:
+    if not (path / "config.json").exists():
+        run_directory.create(path, config)
+    return train(path, config, report=report)
