@@ -1,6 +1,8 @@
 """Errors a user can mend. Each message is one paragraph that says what to do."""
 
+import contextlib
 import traceback
+from collections.abc import Iterator
 
 
 class RaceError(Exception):
@@ -36,3 +38,18 @@ def described(error: Exception) -> str:
     frames = traceback.extract_tb(error.__traceback__)
     place = f", in {frames[-1].filename}, line {frames[-1].lineno}" if frames else ""
     return f"{type(error).__name__}: {error}{place}"
+
+
+@contextlib.contextmanager
+def blamed(kind: type[RaceError], what: str) -> Iterator[None]:
+    """Errors of code that is not our own become a ``kind`` that says what failed; ours pass.
+
+    Raises:
+        RaceError: of that kind, or as it was raised.
+    """
+    try:
+        yield
+    except RaceError:
+        raise
+    except Exception as error:
+        raise kind(f"{what}: {described(error)}.") from error

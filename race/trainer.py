@@ -55,19 +55,19 @@ def train(
     task = make_task(config.task, config.env)
     with run_directory.lock(path):
         newest = checkpoints.newest(directory.checkpoints)
-        made = Progress() if newest is None else progress_of(checkpoints.load(newest, tables=False))
+        saved = None if newest is None else checkpoints.load(newest)
+        made = Progress() if saved is None else progress_of(saved)
         if not _must_go_on(path, config, extend, made):
             run_directory.mark_finished(path)
             return made
         rollouts = rollouts_of(config, task)
-        if newest is None:
+        if saved is None:
             state = fresh(config, task.spec, algorithm, rollouts.empty_replay())
         else:
             # An empty buffer beside the full one would take as much memory again.
             shapes = jax.eval_shape(rollouts.empty_replay)
-            saved = checkpoints.load(newest)
             state = from_checkpoint(saved, config, task.spec, algorithm, shapes)
-            del saved  # its buffer too
+        del saved  # its buffer too
         with (
             rollouts,
             MetricsWriter(directory.metrics, state.progress.metrics_offset) as metrics,

@@ -1,6 +1,5 @@
 """``race render``."""
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import tyro
 
 from race.config import TeamName
-from race.errors import ConfigError, RaceError, RenderError, described
+from race.errors import ConfigError, RenderError, blamed
 
 PolicyName = Literal["scripted", "random"]
 _SECONDS = 15.0
@@ -110,7 +109,7 @@ def _render_run(chosen: Render, out: Path) -> None:
     from race import run_directory
     from race.cli.compilation import use_cache
 
-    console, asked = Console(stderr=True), chosen.seconds
+    console = Console(stderr=True)
     discrete = run_directory.open_run(Path(chosen.what)).discrete
     renderer = None
     if not discrete:
@@ -125,11 +124,11 @@ def _render_run(chosen: Render, out: Path) -> None:
     use_cache()
     with console.status("loading the team"):
         trained = load_trained(Path(chosen.what))
-    drawn = (
-        _draw_discrete(chosen, trained, chosen.seconds or 0.0, console)
-        if renderer is None
-        else _continuous(chosen, trained, _SECONDS if asked is None else asked, renderer)
-    )
+    if renderer is None:
+        drawn = _draw_discrete(chosen, trained, chosen.seconds or 0.0, console)
+    else:
+        seconds = _SECONDS if chosen.seconds is None else chosen.seconds
+        drawn = _continuous(chosen, trained, seconds, renderer)
     labels = {"marl": "MARL team", "champion": "champion"}
     _write(drawn, labels[trained.resolve(chosen.team or "selected")], out, console)
 
@@ -165,7 +164,7 @@ def _draw_discrete(chosen: Render, trained: Any, seconds: float, console: Any) -
         raise ConfigError(f"The --seed of an episode must be below {2**31}.")
     head = trained.heads[trained.resolve(chosen.team or "selected")]
     # Without somebody to draw, there is nothing to play either.
-    with _theirs("when it was made for pictures"):
+    with blamed(RenderError, "The environment failed when it was made for pictures"):
         env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
     with (
         console.status("playing the episode"),
@@ -220,19 +219,8 @@ def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
 
 
 def _guarded(frames: Iterator[Any]) -> Iterator[Any]:
-    with _theirs("while it was drawn"):
+    with blamed(RenderError, "The environment failed while it was drawn"):
         yield from frames
-
-
-@contextlib.contextmanager
-def _theirs(when: str) -> Iterator[None]:
-    """Mistakes of an environment that is not our own are told as such."""
-    try:
-        yield
-    except RaceError:
-        raise
-    except Exception as error:
-        raise RenderError(f"The environment failed {when}: {described(error)}.") from error
 
 
 def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:

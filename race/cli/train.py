@@ -91,7 +91,6 @@ def _parse(arguments: list[str]) -> Train:
 
 def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> None:
     """Settings that would not be used are mistakes, and costly ones if not told."""
-    kind = "discrete" if discrete else "continuous"
     if discrete and preset != "paper":
         raise ConfigError(
             f"--preset {preset} has no effect on {asked.task}: its actions are discrete, and the "
@@ -102,13 +101,13 @@ def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> Non
         unused = _changed("learner", asked.learner, LearnerConfig())
         if ":" not in asked.task:  # a task of the user's own is given these settings
             unused += _changed("env", asked.env, EnvConfig())
-        instead = "--facmac.*"
+        kind, instead = "discrete", "--facmac.*"
     else:
         # The mixer is all that FACMAC shares with its form for continuous actions.
         mixes = "facmac" in (asked.algo, asked.base)
         used = {"mixer_size", "hypernet_size"} if mixes else set()
         unused = _changed("facmac", asked.facmac, FacmacConfig(), used)
-        instead = "--learner.*"
+        kind, instead = "continuous", "--learner.*"
     if unused:
         raise ConfigError(
             f"{' and '.join(unused)} would have no effect on {asked.task}. Its actions are {kind}; "

@@ -15,7 +15,7 @@ import numpy as np
 
 from race.config import EnvConfig
 from race.envs import discrete_probe, mamujoco, probe
-from race.errors import RaceError, TaskError, described
+from race.errors import TaskError, blamed
 from race.types import AnyTask, DiscreteTask, EnvSpec, Task
 
 __all__ = [
@@ -193,12 +193,8 @@ def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
         and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
         for parameter in inspect.signature(function).parameters.values()
     )
-    try:
+    with blamed(TaskError, f"Task {task_id}: {function_name} failed"):
         task = function(config) if required else function()
-    except RaceError:
-        raise
-    except Exception as error:
-        raise TaskError(f"Task {task_id}: {function_name} failed: {described(error)}.") from error
     if not isinstance(task, Task | DiscreteTask):
         raise TaskError(
             f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "

@@ -146,16 +146,18 @@ class EpisodeRollouts:
         for name, column in shown.items():
             values = np.asarray(column)
             strange = np.argwhere(~np.isfinite(values))
-            if len(strange):
-                team, step = strange[0][:2]
-                raise DivergenceError(
-                    f"The environment of team {team} gave {name} in {where}, after {step} steps, "
-                    f"with the entry {values[tuple(strange[0])]}. "
-                    + (
-                        "That is no number. Look at the task."
-                        if np.isnan(values[tuple(strange[0])])
-                        else "The replay buffer keeps numbers up to 65504 with "
-                        "--facmac.replay-precision float16, larger ones with float32; better "
-                        "scale what the task shows to about 1."
-                    )
+            if len(strange) == 0:
+                continue
+            team, step = strange[0][:2]
+            entry = values[tuple(strange[0])]
+            advice = "That is no number. Look at the task."
+            if not np.isnan(entry):
+                advice = (
+                    "The replay buffer keeps numbers up to 65504 with --facmac.replay-precision "
+                    "float16, larger ones with float32; better scale what the task shows to "
+                    "about 1."
                 )
+            raise DivergenceError(
+                f"The environment of team {team} gave {name} in {where}, after {step} steps, "
+                f"with the entry {entry}. {advice}"
+            )

@@ -1,5 +1,6 @@
 """Episodes of tasks with discrete actions on the host, such as the real StarcraftII."""
 
+from contextlib import AbstractContextManager
 from functools import partial
 from types import TracebackType
 from typing import Any, final
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
-from race.errors import RaceError, TaskError, described
+from race.errors import TaskError, blamed
 from race.rollouts.choosing import Exploration, blank, choose
 from race.rollouts.episodes import Played, empty_episode
 from race.types import DiscreteTask, Observation
@@ -53,12 +54,8 @@ class HostEnvs:
         """
         spec, count = self.task.spec, len(seeds)
         while len(self._envs) < count:
-            try:
+            with self._blamed(f"making of environment {len(self._envs)}"):
                 self._envs.append(self.task.make(None))
-            except RaceError:
-                raise
-            except Exception as error:
-                raise self._failed(error, f"making of environment {len(self._envs)}") from error
         episodes = empty_episode(spec, precision, count)
         returns, won = np.zeros(count, np.float32), np.zeros(count, bool)
         seen = Observation(
@@ -122,7 +119,7 @@ class HostEnvs:
 
     def _see(self, seen: Observation, team: int, move: Any) -> Any:
         """Makes a move in a team's environment and writes down what it shows."""
-        try:
+        with self._blamed(f"environment {team}"):
             observation, outcome = move(self._envs[team])
             for name, column in seen._asdict().items():
                 value = np.asarray(observation[name])
@@ -132,10 +129,6 @@ class HostEnvs:
                         f"{value.shape}; its DiscreteSpec says {column.shape[1:]}."
                     )
                 column[team] = value
-        except RaceError:  # such as those of race.envs.pymarl, which name the task and the mistake
-            raise
-        except Exception as error:
-            raise self._failed(error, f"environment {team}") from error
         idle = np.flatnonzero(~seen.avail_actions[team].any(axis=1))
         if len(idle):
             raise TaskError(
@@ -144,10 +137,9 @@ class HostEnvs:
             )
         return outcome
 
-    def _failed(self, error: Exception, what: str) -> TaskError:
-        return TaskError(
-            f"The environment of {self.task.spec.task} failed ({what}): {described(error)}."
-        )
+    def _blamed(self, what: str) -> AbstractContextManager[None]:
+        # The errors of race.envs.pymarl pass: they name the task and the mistake themselves.
+        return blamed(TaskError, f"The environment of {self.task.spec.task} failed ({what})")
 
 
 def _write(episodes: Any, seen: Observation, team: int, place: int) -> None:
