@@ -129,11 +129,12 @@ def check(config: Config) -> None:
         ),
         *_facmac_rules(facmac, config.n_teams),
         (
-            race.population_size >= 4,
+            race.population_size >= 4 + race.elite_copy,
             "race.population-size",
             race.population_size,
-            "at least 4: an elite, a second parent, a team for their offspring and one for the "
-            f"injected MARL team (for no population use --algo {config.base})",
+            f"at least {4 + race.elite_copy}: an elite, a second parent, "
+            f"{'a copy of the elite, ' * race.elite_copy}a team for their offspring and one for "
+            f"the injected MARL team (for no population use --algo {config.base})",
         ),
         (
             0 <= race.mutation_fraction <= 1,

@@ -17,6 +17,7 @@ Algo = Literal["race", "matd3", "maddpg", "facmac"]
 Base = Literal["matd3", "maddpg", "facmac"]
 Preset = Literal["paper", "td3", "demo"]
 ReplayPrecision = Literal["float16", "float32"]
+MutationDraw = Literal["row", "weight"]
 TeamName = Literal["marl", "champion", "selected"]
 
 
@@ -26,6 +27,8 @@ class LearnerConfig:
 
     hidden_sizes: tuple[int, int] = (400, 300)
     """Units of the two layers of each encoder and critic (Table 1, Table 2)."""
+    layer_norm: bool = True
+    """Normalise the layers of encoders, critics and PeVFA before each activation."""
     batch_size: int = 128
     """Transitions in a minibatch."""
     actor_learning_rate: float = 1e-3
@@ -71,6 +74,8 @@ class FacmacConfig:
     """Units of the two layers of the agents' utilities."""
     value_size: int = 32
     """Units of the state-value net (Appendix A.1)."""
+    layer_norm: bool = False
+    """Normalise the layers of the encoder, the utilities and their PeVFA before each ReLU."""
     batch_size: int = 32
     """Episodes in a minibatch."""
     actor_learning_rate: float = 2.5e-3
@@ -115,6 +120,11 @@ class RaceConfig:
     """Probability that a team that is not the elite mutates."""
     agent_mutation_probability: float = 0.5
     """Probability that an agent of a mutating team is picked (at least one is)."""
+    mutation_draw: MutationDraw = "row"
+    """Whether a mutation's kind (strong, reset or mild) is drawn once per action row of a picked
+    head or once per weight."""
+    elite_copy: bool = True
+    """A copy of the elite enters the next population and is open to mutation."""
     tournament_size: int = 3
     """Teams from which the second parent is the best."""
     policy_embedding_size: int = 64

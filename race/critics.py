@@ -15,6 +15,7 @@ from race.networks import (
     head_vectors,
     init_dense,
     init_policy_embedding,
+    normalise,
     stack,
 )
 from race.types import EnvSpec
@@ -26,6 +27,7 @@ class Critic(eqx.Module):
     first: Dense  # weight [K, S + U, h1]
     hidden: Dense  # weight [K, h1, h2]
     out: Dense  # weight [K, h2, 1]
+    layer_norm: bool = eqx.field(static=True)  # before each activation
 
 
 def init_critic(
@@ -33,6 +35,7 @@ def init_critic(
     spec: EnvSpec,
     hidden_sizes: tuple[int, int],
     count: int,
+    layer_norm: bool,
     further_inputs: int = 0,
 ) -> Critic:
     """Fresh critics; ``further_inputs`` only narrows the first layer's initial range."""
@@ -46,6 +49,7 @@ def init_critic(
                 init_dense(k1, inputs, h1, fan_in=inputs + further_inputs),
                 init_dense(k2, h1, h2),
                 init_dense(k3, h2, 1),
+                layer_norm,
             )
         )
     return stack(critics)
@@ -70,8 +74,9 @@ def q_values(
     x = critic.first(jnp.broadcast_to(x, (critic.first.bias.shape[0], *x.shape)))
     if shift is not None:
         x = x + shift[:, None]
-    x = jax.nn.leaky_relu(x)
-    x = jax.nn.leaky_relu(critic.hidden(x))
+    x = jax.nn.leaky_relu(normalise(x) if critic.layer_norm else x)
+    x = critic.hidden(x)
+    x = jax.nn.leaky_relu(normalise(x) if critic.layer_norm else x)
     return critic.out(x)[:, :, 0]
 
 
@@ -97,11 +102,15 @@ def init_pevfa(
     spec: EnvSpec,
     hidden_sizes: tuple[int, int],
     count: int,
+    layer_norm: bool,
     embedding_size: int,
 ) -> Pevfa:
-    """A fresh PeVFA; ``hidden_sizes[1]`` is also the size of the observation embeddings."""
+    """A fresh PeVFA; ``hidden_sizes[1]`` is also the size of the observation embeddings.
+
+    ``layer_norm`` is of the critic: the policy embedding is not normalised.
+    """
     critic_key, embedding_key, weight_key = jax.random.split(key, 3)
-    critic = init_critic(critic_key, spec, hidden_sizes, count, embedding_size)
+    critic = init_critic(critic_key, spec, hidden_sizes, count, layer_norm, embedding_size)
     fan_in = spec.state_size + spec.joint_action_size + embedding_size
     bound = 1.0 / np.sqrt(fan_in)
     return Pevfa(

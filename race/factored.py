@@ -23,6 +23,7 @@ from race.networks import (
     embed_policy,
     init_dense,
     init_policy_embedding,
+    normalise,
 )
 
 
@@ -32,6 +33,7 @@ class Utilities(eqx.Module):
     first: Dense  # weight [*stack, O + A, h1]
     hidden: Dense  # weight [*stack, h1, h2]
     out: Dense  # weight [*stack, h2, 1]
+    layer_norm: bool = eqx.field(static=True)  # before each activation
 
 
 class Mixer(eqx.Module):
@@ -74,6 +76,7 @@ def init_utilities(
     obs_size: int,
     action_size: int,
     sizes: tuple[int, int],
+    layer_norm: bool,
     further_inputs: int = 0,
     padding: int = 0,
 ) -> Utilities:
@@ -84,6 +87,7 @@ def init_utilities(
         init_dense(k1, inputs, sizes[0], fan_in=inputs + further_inputs - padding),
         init_dense(k2, *sizes),
         init_dense(k3, sizes[1], 1),
+        layer_norm,
     )
 
 
@@ -120,8 +124,9 @@ def utility_values(
     x = utilities.first(inputs)
     if shift is not None:
         x = x + shift[..., None, :]
-    x = jax.nn.relu(x)
-    x = jax.nn.relu(utilities.hidden(x))
+    x = jax.nn.relu(normalise(x) if utilities.layer_norm else x)
+    x = utilities.hidden(x)
+    x = jax.nn.relu(normalise(x) if utilities.layer_norm else x)
     return utilities.out(x)[..., 0]
 
 

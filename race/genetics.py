@@ -11,8 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from race.config import MutationDraw
+
 Head = Float[Array, "N H1 A"]
 Heads = Float[Array, "P N H1 A"]
+Number = float | Float[Array, ""]
 
 # Of the weights that mutate, this share is perturbed strongly, and another such share is redrawn;
 # the rest is perturbed weakly. Shares and strengths are those of the genetic algorithm that the
@@ -91,22 +94,37 @@ def _subset(key: PRNGKeyArray, n: int) -> Bool[Array, "n"]:
 
 
 def mutate_agent(
-    weights: Float[Array, "H1 A"], mask: Bool[Array, "A"], fraction: float, key: PRNGKeyArray
+    weights: Float[Array, "H1 A"],
+    mask: Bool[Array, "A"],
+    fraction: Number,
+    key: PRNGKeyArray,
+    draw: MutationDraw,
 ) -> Float[Array, "H1 A"]:
     """Perturbs one agent's head, the function P of Section 3.3.
 
-    In each action's row of weights w, ``fraction`` (the paper's alpha) of the entries change,
-    rounded to a whole number but at least one if alpha is positive: most by N(0, (0.1 w)^2), a
-    share of 0.05 by N(0, (10 w)^2), and a share of 0.05 is redrawn from N(0, 1). What changes is
-    kept within `LARGEST_WEIGHT`. Biases and padding stay.
+    In each action's row of weights w, ``fraction`` (the paper's alpha) of the entries change in
+    expectation: as many as the whole part of alpha times inputs, and one more with the probability
+    of the rest. A change is mild, by N(0, (0.1 w)^2), or with probability 0.05 strong, by
+    N(0, (10 w)^2), or with probability 0.05 a reset to N(0, 1). What changes is kept within
+    `LARGEST_WEIGHT`. Biases and padding stay.
+
+    Args:
+        weights: the head; the last row holds the biases.
+        mask: the actions that are not padding.
+        fraction: alpha, in [0, 1].
+        key: random key.
+        draw: whether the kind of change is drawn once per action row or once per weight.
     """
-    n_weights = weights.shape[0] - 1
-    n_picked = max(1, round(fraction * n_weights)) if fraction > 0 else 0
-    pick_key, kind_key, noise_key = jax.random.split(key, 3)
+    count_key, pick_key, kind_key, noise_key = jax.random.split(key, 4)
     w = weights[:-1]
+    expected = fraction * jnp.asarray(w.shape[0], w.dtype)
+    whole = jnp.floor(expected)
+    one_more = jax.random.uniform(count_key, w.shape[1:]) < expected - whole
+    n_picked = whole + one_more.astype(w.dtype)
     order = jnp.argsort(jax.random.uniform(pick_key, w.shape), axis=0)
-    picked = jnp.argsort(order, axis=0) < n_picked
-    kind = jax.random.uniform(kind_key, w.shape)
+    picked = jnp.argsort(order, axis=0).astype(w.dtype) < n_picked[None]
+    kind = jax.random.uniform(kind_key, w.shape if draw == "weight" else (1, w.shape[1]))
+    kind = jnp.broadcast_to(kind, w.shape)
     noise = jax.random.normal(noise_key, w.shape)
     strength = jnp.where(kind < STRONG_SHARE, STRONG_STRENGTH, WEAK_STRENGTH)
     perturbed = w + noise * strength * jnp.abs(w)
@@ -119,51 +137,58 @@ def mutate_agent(
 def mutate(
     team: Head,
     mask: Bool[Array, "N A"],
-    fraction: float,
-    agent_probability: float,
+    fraction: Number,
+    agent_probability: Number,
     key: PRNGKeyArray,
+    draw: MutationDraw,
 ) -> Head:
     """Agent-level mutation: each agent is picked with ``agent_probability``, at least one is."""
     n = team.shape[0]
     pick_key, one_key, mutate_key = jax.random.split(key, 3)
     picked = jax.random.uniform(pick_key, (n,)) < agent_probability
     picked = picked | (~jnp.any(picked) & (jnp.arange(n) == jax.random.randint(one_key, (), 0, n)))
-    mutated = jax.vmap(mutate_agent, in_axes=(0, 0, None, 0))(
-        team, mask, fraction, jax.random.split(mutate_key, n)
+    mutated = jax.vmap(mutate_agent, in_axes=(0, 0, None, 0, None))(
+        team, mask, fraction, jax.random.split(mutate_key, n), draw
     )
     return jnp.where(picked[:, None, None], mutated, team)
 
 
-def breed(heads: Heads, chosen: Selection, key: PRNGKeyArray) -> Heads:
-    """Replaces every team that is neither elite nor parent by an offspring of these two.
+def breed(heads: Heads, chosen: Selection, key: PRNGKeyArray, elite_copy: bool) -> Heads:
+    """Fills the places of the teams that are neither elite nor parent.
 
-    Each crossover gives two offspring; they fill the replaced places from the fittest down, as
-    many crossovers as that takes.
+    From the fittest of these places down: with ``elite_copy`` a copy of the elite, then offspring
+    of elite and parent. Each crossover gives two offspring, and there are as many crossovers as
+    it takes.
     """
-    n_replaced = chosen.replaced.shape[0]
+    places = chosen.replaced
+    if elite_copy:
+        heads = heads.at[places[0]].set(heads[chosen.elite])
+        places = places[1:]
+    n_replaced = places.shape[0]
     keys = jax.random.split(key, (n_replaced + 1) // 2)
     first, second = jax.vmap(crossover, in_axes=(None, None, 0))(
         heads[chosen.elite], heads[chosen.parent], keys
     )
     offspring = jnp.stack([first, second], axis=1).reshape(-1, *heads.shape[1:])
-    return heads.at[chosen.replaced].set(offspring[:n_replaced])
+    return heads.at[places].set(offspring[:n_replaced])
 
 
 def mutate_population(
     heads: Heads,
     elite: Int[Array, ""],
     mask: Bool[Array, "N A"],
-    fraction: float,
-    team_probability: float,
-    agent_probability: float,
+    fraction: Number,
+    team_probability: Number,
+    agent_probability: Number,
     key: PRNGKeyArray,
+    draw: MutationDraw,
 ) -> Heads:
     """Mutates each team but the elite with ``team_probability``."""
     n = heads.shape[0]
     pick_key, mutate_key = jax.random.split(key)
     picked = (jax.random.uniform(pick_key, (n,)) < team_probability) & (jnp.arange(n) != elite)
-    mutated = jax.vmap(mutate, in_axes=(0, None, None, None, 0))(
-        heads, mask, fraction, agent_probability, jax.random.split(mutate_key, n)
+    mutated = jax.vmap(mutate, in_axes=(0, None, None, None, 0, None))(
+        heads, mask, fraction, agent_probability, jax.random.split(mutate_key, n), draw
     )
     return jnp.where(picked[:, None, None, None], mutated, heads)
 

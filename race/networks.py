@@ -39,6 +39,17 @@ def init_dense(
     )
 
 
+VARIANCE_FLOOR = 1e-5
+"""What layer normalisation adds to a variance, so that equal entries stay finite."""
+
+
+def normalise(x: Float[Array, "*b h"]) -> Float[Array, "*b h"]:
+    """Layer normalisation (Ba et al. 2016) without a learned scale: mean 0, variance 1."""
+    centred = x - jnp.mean(x, axis=-1, keepdims=True)
+    variance = jnp.mean(jnp.square(centred), axis=-1, keepdims=True)
+    return centred * jax.lax.rsqrt(variance + VARIANCE_FLOOR)
+
+
 def stack(trees: list[Any]) -> Any:
     """Stacks equal pytrees along a new leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
@@ -49,16 +60,21 @@ class Encoder(eqx.Module):
 
     hidden: Dense  # weight [N, O, h1]
     out: Dense  # weight [N, h1, H]
+    layer_norm: bool = eqx.field(static=True)  # before each activation
 
 
-def init_encoder(key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, int]) -> Encoder:
+def init_encoder(
+    key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, int], layer_norm: bool
+) -> Encoder:
     """Fresh encoders, one per agent. Rows of padded observation entries are never used."""
     h1, h2 = hidden_sizes
     agents = []
     for agent_key, size in zip(jax.random.split(key, spec.n_agents), spec.obs_sizes, strict=True):
         k1, k2 = jax.random.split(agent_key)
         agents.append(
-            Encoder(init_dense(k1, spec.obs_size, h1, fan_in=size), init_dense(k2, h1, h2))
+            Encoder(
+                init_dense(k1, spec.obs_size, h1, fan_in=size), init_dense(k2, h1, h2), layer_norm
+            )
         )
     return stack(agents)
 
@@ -68,7 +84,9 @@ def encode(encoder: Encoder, spec: EnvSpec, state: Float[Array, "B S"]) -> Float
     obs = jnp.moveaxis(jnp.take(state, spec.obs_gather, axis=1), 1, 0)  # [N, B, O]
     if not spec.obs_mask.all():
         obs = obs * jnp.asarray(spec.obs_mask, obs.dtype)[:, None, :]
-    return jnp.tanh(encoder.out(jnp.tanh(encoder.hidden(obs))))
+    x = encoder.hidden(obs)
+    x = encoder.out(jnp.tanh(normalise(x) if encoder.layer_norm else x))
+    return jnp.tanh(normalise(x) if encoder.layer_norm else x)
 
 
 def init_head(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int) -> Float[Array, "N H1 A"]:

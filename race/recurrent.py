@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.gru import Gates, gru, gru_step
-from race.networks import Dense, init_dense
+from race.networks import Dense, init_dense, normalise
 
 
 class GruEncoder(eqx.Module):
@@ -23,10 +23,11 @@ class GruEncoder(eqx.Module):
     agent: Float[Array, "N H"]
     into: Dense  # weight [H, 3 H], input to gates
     recurrent: Dense  # weight [H, 3 H], state to gates
+    layer_norm: bool = eqx.field(static=True)  # before the activation of the dense layer
 
 
 def init_gru_encoder(
-    key: PRNGKeyArray, obs_size: int, n_actions: int, n_agents: int, size: int
+    key: PRNGKeyArray, obs_size: int, n_actions: int, n_agents: int, size: int, layer_norm: bool
 ) -> GruEncoder:
     """A fresh encoder; each layer uniform in ``+-1/sqrt(inputs)``."""
     keys = jax.random.split(key, 5)
@@ -42,6 +43,7 @@ def init_gru_encoder(
         rows(keys[2], n_agents),
         init_dense(keys[3], size, 3 * size),
         init_dense(keys[4], size, 3 * size),
+        layer_norm,
     )
 
 
@@ -66,7 +68,8 @@ def gate_inputs(
     weight = jnp.concatenate([encoder.obs.weight, encoder.last_action])
     x = both @ weight
     shift = encoder.agent + encoder.obs.bias[None]
-    x = jax.nn.relu(x + jnp.broadcast_to(shift, x.shape)).reshape(-1, x.shape[-1])
+    x = x + jnp.broadcast_to(shift, x.shape)
+    x = jax.nn.relu(normalise(x) if encoder.layer_norm else x).reshape(-1, x.shape[-1])
     weights, biases = _gates(encoder.into)
     shape = (*last_action.shape, -1)
     return Gates(*((x @ w + b[None]).reshape(shape) for w, b in zip(weights, biases, strict=True)))

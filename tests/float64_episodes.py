@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from float64_factored import normal
 
 NONE = np.zeros(0)
 
@@ -91,7 +92,7 @@ def gru_moment(encoder: Any, h: np.ndarray, obs: np.ndarray, last: np.ndarray) -
         x = obs[i] @ encoder.obs.weight + encoder.obs.bias + encoder.agent[i]
         if last[i] >= 0:
             x = x + encoder.last_action[last[i]]
-        a_r, a_u, a_c = np.split(dense(encoder.into, relu(x)), [size, 2 * size])
+        a_r, a_u, a_c = np.split(dense(encoder.into, relu(normal(encoder, x))), [size, 2 * size])
         h_r, h_u, h_c = np.split(dense(encoder.recurrent, h[i]), [size, 2 * size])
         r, u = sigmoid(a_r + h_r), sigmoid(a_u + h_u)
         after.append((1 - u) * np.tanh(a_c + r * h_c) + u * h[i])
@@ -142,8 +143,8 @@ def q_tot(
     q = np.empty((steps, agents))
     for i in range(agents):
         x = np.concatenate([obs[:, i], action[:, i], np.tile(e, (steps, 1))], axis=1)
-        x = relu(x @ first + net.first.bias)
-        q[:, i] = dense(net.out, relu(dense(net.hidden, x)))[:, 0]
+        x = relu(normal(net, x @ first + net.first.bias))
+        q[:, i] = dense(net.out, relu(normal(net, dense(net.hidden, x))))[:, 0]
     g, m = mixer.weights_out.weight.shape
     x = np.concatenate([state, np.tile(e, (steps, 1))], axis=1) @ hyper + mixer.first.bias
     to_in, to_out, to_bias, bias_in = np.split(x, [g, 2 * g, 2 * g + m], axis=1)

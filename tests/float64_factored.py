@@ -19,6 +19,13 @@ def elu(x: np.ndarray) -> np.ndarray:
     return np.where(x > 0, x, np.exp(np.minimum(x, 0.0)) - 1.0)
 
 
+def normal(network: Any, x: np.ndarray) -> np.ndarray:
+    """A layer of one sample or several, of mean 0 and variance 1 where the network normalises."""
+    if not network.layer_norm:
+        return x
+    return (x - x.mean(-1, keepdims=True)) / np.sqrt(x.var(-1, keepdims=True) + 1e-5)
+
+
 def utility(
     critic: Any,
     agent: int,
@@ -33,8 +40,8 @@ def utility(
     obs, own = s[list(spec.obs_index[agent])], u[list(spec.action_index[agent])]
     weight = net.first.weight[agent]
     rows = np.concatenate([weight[: len(obs)], weight[spec.obs_size :][: len(own)], e_weight])
-    x = relu(np.concatenate([obs, own, e]) @ rows + net.first.bias[agent])
-    x = relu(x @ net.hidden.weight[agent] + net.hidden.bias[agent])
+    x = relu(normal(net, np.concatenate([obs, own, e]) @ rows + net.first.bias[agent]))
+    x = relu(normal(net, x @ net.hidden.weight[agent] + net.hidden.bias[agent]))
     return float((x @ net.out.weight[agent] + net.out.bias[agent])[0])
 
 

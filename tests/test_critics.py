@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from float64_factored import normal
 
 from race.critics import (
     first_critic,
@@ -40,11 +41,12 @@ def mlp(
     x: np.ndarray,
     layers: list[tuple[np.ndarray, np.ndarray]],
     activation: Callable[[np.ndarray], np.ndarray] = leaky,
+    network: Any = None,
 ) -> float:
     for place, (weight, bias) in enumerate(layers):
         x = x @ weight + bias
         if place < len(layers) - 1:
-            x = activation(x)
+            x = activation(x if network is None else normal(network, x))
     (value,) = x
     return float(value)
 
@@ -55,11 +57,12 @@ def inputs() -> tuple[jax.Array, jax.Array]:
     return jax.random.normal(state_key, (B, 4)), jax.random.normal(action_key, (B, 3))
 
 
+@pytest.mark.parametrize("layer_norm", [True, False], ids=["normalised", "plain"])
 @pytest.mark.parametrize("count", [1, 2])
 def test_each_critic_of_the_ensemble(
-    tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array], count: int
+    tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array], count: int, layer_norm: bool
 ) -> None:
-    critic = init_critic(jax.random.key(1), tiny_spec, (5, H), count)
+    critic = init_critic(jax.random.key(1), tiny_spec, (5, H), count, layer_norm)
     q = q_values(critic, *inputs)
     assert q.shape == (count, B)
     w = float64(critic)
@@ -67,16 +70,18 @@ def test_each_critic_of_the_ensemble(
         layers = [(x.weight[k], x.bias[k]) for x in (w.first, w.hidden, w.out)]
         for b in range(B):
             su = np.concatenate([float64(inputs[0][b]), float64(inputs[1][b])])
-            np.testing.assert_allclose(q[k, b], mlp(su, layers), rtol=1e-5, atol=1e-6)
+            expected = mlp(su, layers, network=critic)
+            np.testing.assert_allclose(q[k, b], expected, rtol=1e-5, atol=1e-6)
     assert jnp.array_equal(q_values(first_critic(critic), *inputs), q[:1])
     if count == 2:
         assert not np.allclose(q[0], q[1])
 
 
+@pytest.mark.parametrize("layer_norm", [True, False], ids=["normalised", "plain"])
 def test_pevfa_is_a_critic_of_state_action_and_embedding(
-    tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array]
+    tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array], layer_norm: bool
 ) -> None:
-    pevfa = init_pevfa(jax.random.key(2), tiny_spec, (5, H), 2, E)
+    pevfa = init_pevfa(jax.random.key(2), tiny_spec, (5, H), 2, layer_norm, E)
     head = init_head(jax.random.key(3), tiny_spec, H)
     q = pevfa_values(pevfa, tiny_spec, *inputs, head)
     w = float64(pevfa)
@@ -90,14 +95,15 @@ def test_pevfa_is_a_critic_of_state_action_and_embedding(
         ]
         for b in range(B):
             sue = np.concatenate([float64(inputs[0][b]), float64(inputs[1][b]), e])
-            np.testing.assert_allclose(q[k, b], mlp(sue, layers), rtol=1e-5, atol=1e-6)
+            expected = mlp(sue, layers, network=pevfa.critic)
+            np.testing.assert_allclose(q[k, b], expected, rtol=1e-5, atol=1e-6)
     assert jnp.array_equal(pevfa_values(first_pevfa(pevfa), tiny_spec, *inputs, head), q[:1])
 
 
 def test_pevfa_tells_teams_apart_but_not_their_padding(
     tiny_spec: EnvSpec, inputs: tuple[jax.Array, jax.Array]
 ) -> None:
-    pevfa = init_pevfa(jax.random.key(2), tiny_spec, (5, H), 2, E)
+    pevfa = init_pevfa(jax.random.key(2), tiny_spec, (5, H), 2, False, E)
     head = init_head(jax.random.key(3), tiny_spec, H)
     q = pevfa_values(pevfa, tiny_spec, *inputs, head)
     assert jnp.array_equal(pevfa_values(pevfa, tiny_spec, *inputs, head.at[0, :, 1].set(9.0)), q)
@@ -108,7 +114,7 @@ def test_pevfa_tells_teams_apart_but_not_their_padding(
 
 
 def test_first_layers_range_counts_the_embedding(tiny_spec: EnvSpec) -> None:
-    pevfa = init_pevfa(jax.random.key(4), tiny_spec, (200, H), 2, 93)
+    pevfa = init_pevfa(jax.random.key(4), tiny_spec, (200, H), 2, False, 93)
     bound = 1 / np.sqrt(4 + 3 + 93)
     for weight in (pevfa.critic.first.weight, pevfa.embedding_weight):
         assert 0.97 * bound < np.abs(weight).max() <= bound

@@ -124,34 +124,44 @@ def test_crossover_exchanges_whole_heads_of_the_same_agent(agents: int) -> None:
         assert_frequency(both, 0.25, len(KEYS))
 
 
+@pytest.mark.parametrize("copy", [False, True], ids=["no copy", "copy"])
 @pytest.mark.parametrize(("size", "agents"), [(3, 1), (3, 2), (5, 2), (5, 6), (8, 6)])
-def test_breeding_replaces_exactly_those_that_do_not_reproduce(size: int, agents: int) -> None:
+def test_breeding_replaces_exactly_those_that_do_not_reproduce(
+    size: int, agents: int, copy: bool
+) -> None:
     heads = signed_heads(size, agents)
     elite, parent = size - 1, 0
     replaced = jnp.array([t for t in range(size) if t not in (elite, parent)])
     chosen = genetics.Selection(jnp.int32(elite), jnp.int32(parent), replaced, replaced[-1])
     bred = np.asarray(
-        jax.jit(jax.vmap(genetics.breed, in_axes=(None, None, 0)))(heads, chosen, KEYS[:100])
+        jax.jit(jax.vmap(partial(genetics.breed, elite_copy=copy), in_axes=(None, None, 0)))(
+            heads, chosen, KEYS[:100]
+        )
     )
-    heads = np.asarray(heads)
+    heads, places = np.asarray(heads), np.asarray(replaced)
     for kept in (elite, parent):
         assert (bred[:, kept] == heads[kept]).all()
-    for place in np.asarray(replaced):
+    if copy:
+        # The fittest of the places is the elite's copy; the elite stays where it is.
+        assert (bred[:, places[0]] == heads[elite]).all()
+        places = places[1:]
+    for place in places:
         from_elite = (bred[:, place] == heads[elite]).all(axis=(2, 3))
         from_parent = (bred[:, place] == heads[parent]).all(axis=(2, 3))
         assert (from_elite ^ from_parent).all()
         if agents > 1:
             assert not from_elite.all(axis=1).any()
             assert not from_parent.all(axis=1).any()
-    if agents > 2 and size > 4:
+    if agents > 2 and len(places) > 2:
         # Each crossover has a key of its own.
-        first, third = bred[:, np.asarray(replaced)[0]], bred[:, np.asarray(replaced)[2]]
+        first, third = bred[:, places[0]], bred[:, places[-1 if copy else 2]]
         assert (first != third).any(axis=(1, 2, 3)).mean() > 0.5
 
 
 # --- mutation ------------------------------------------------------------------------------
 
 H = 8
+DRAWS = ("row", "weight")
 MASK = jnp.array([True, True, False])
 
 
@@ -160,42 +170,77 @@ def head_with_padding(agents: int = 1) -> jax.Array:
     return 1.0 + jax.random.uniform(jax.random.key(5), (agents, H + 1, 3))
 
 
+@pytest.mark.parametrize("draw", DRAWS)
 @pytest.mark.parametrize("fraction", [0.0, 0.01, 0.25, 0.7, 1.0])
-def test_mutation_changes_exactly_the_fraction_of_each_row(fraction: float) -> None:
+def test_mutation_changes_the_fraction_of_each_row_in_expectation(
+    fraction: float, draw: genetics.MutationDraw
+) -> None:
     head = head_with_padding()[0]
     mutate = jax.jit(
-        jax.vmap(partial(genetics.mutate_agent, head, MASK, fraction))  # one program for all keys
+        jax.vmap(partial(genetics.mutate_agent, head, MASK, draw=draw), in_axes=(None, 0))
     )
-    mutated = np.asarray(mutate(KEYS[:400]))
+    mutated = np.asarray(mutate(jnp.float32(fraction), KEYS))
     changed = mutated != np.asarray(head)
-    expected = {0.0: 0, 0.01: 1, 0.25: 2, 0.7: 6, 1.0: 8}[fraction]  # at least one if any
-    assert (changed[:, :-1, :2].sum(axis=1) == expected).all()
+    # The whole part of alpha times inputs, and one more with the probability of the rest.
+    whole, rest = divmod(fraction * H, 1.0)
+    counts = changed[:, :-1, :2].sum(axis=1)
+    assert np.isin(counts, [whole, whole + 1] if rest > 0 else [whole]).all()
+    for row in range(2):
+        assert_frequency((counts[:, row] > whole).sum(), rest, len(KEYS))
+    if 0 < rest < 1:
+        # Rows draw their numbers for themselves.
+        assert_frequency((counts > whole).all(axis=1).sum(), rest**2, len(KEYS))
     assert not changed[:, -1].any()  # biases
     assert not changed[:, :, 2].any()  # padding
     # Every weight is as likely to be picked as any other, and rows are picked for themselves.
     for count in changed[:, :-1, :2].sum(axis=0).ravel():
-        assert_frequency(count, expected / H, 400)
+        assert_frequency(count, fraction, len(KEYS))
     if fraction == 0.25:
         assert (changed[:, :, 0] != changed[:, :, 1]).any(axis=1).mean() > 0.9
 
 
 def test_mutated_weights_are_bounded_and_others_are_left_alone() -> None:
     head = jnp.full((1, 301, 2), 50.0)
-    mutated = genetics.mutate_agent(head[0], jnp.ones(2, bool), 0.5, jax.random.key(0))[:-1]
+    key = jax.random.key(0)
+    mutated = genetics.mutate_agent(head[0], jnp.ones(2, bool), 0.5, key, "weight")[:-1]
     changed = np.asarray(mutated != 50.0)
     assert changed.sum() == 300
     assert np.abs(np.asarray(mutated)[changed]).max() == genetics.LARGEST_WEIGHT
 
 
-def test_shares_and_strengths_of_mutation(monkeypatch: pytest.MonkeyPatch) -> None:
+def changes(
+    rows: int, draw: genetics.MutationDraw, monkeypatch: pytest.MonkeyPatch
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """New weights, relative changes, and which are resets, of ``rows`` rows of 1,000 weights.
+
+    The weights are so large that resets, strong and weak changes are told apart by their size.
+    """
     monkeypatch.setattr(genetics, "LARGEST_WEIGHT", float("inf"))
-    # Weights so large that a reset, a strong and a weak change are told apart by their size.
-    w = jnp.where(jnp.arange(1001)[:, None] % 2 == 0, 1e4, -2e4) * jnp.ones((1001, 100))
-    mutated = genetics.mutate_agent(w, jnp.ones(100, bool), 1.0, jax.random.key(3))[:-1]
+    w = jnp.where(jnp.arange(1001)[:, None] % 2 == 0, 1e4, -2e4) * jnp.ones((1001, rows))
+    mutated = genetics.mutate_agent(w, jnp.ones(rows, bool), 1.0, jax.random.key(3), draw)[:-1]
     new, old = np.asarray(mutated, float), np.asarray(w[:-1], float)
-    change = (new - old) / np.abs(old)
+    return new, (new - old) / np.abs(old), np.abs(new) < 6
+
+
+def test_drawn_by_row_all_changes_of_a_row_are_of_one_kind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, change, reset = changes(2000, "row", monkeypatch)
+    by_reset = reset.mean(axis=0)
+    # Of 1,000 strong changes some 952 are larger than 0.6, of as many weak ones none.
+    by_strong = ((np.abs(change) > 0.6) & ~reset).mean(axis=0)
+    assert np.isin(by_reset, [0.0, 1.0]).all()
+    kinds = np.stack([by_reset == 1.0, by_strong > 0.9, (by_reset == 0.0) & (by_strong < 0.01)])
+    assert (kinds.sum(axis=0) == 1).all()
+    for kind, share in zip(kinds, (0.05, 0.05, 0.9), strict=True):
+        assert_frequency(kind.sum(), share, 2000)
+    np.testing.assert_allclose(np.median(np.abs(change[:, kinds[2]])), 0.0674, rtol=0.02)
+    np.testing.assert_allclose(np.median(np.abs(change[:, kinds[1]])), 6.745, rtol=0.05)
+
+
+def test_drawn_by_weight_shares_and_strengths(monkeypatch: pytest.MonkeyPatch) -> None:
+    new, change, reset = changes(100, "weight", monkeypatch)
     n = new.size
-    reset = np.abs(new) < 6
     weak = ~reset & (np.abs(change) < 0.6)
     strong = ~reset & ~weak
     # 4.8 % of the strong changes are smaller than 0.6.
@@ -216,7 +261,7 @@ def test_shares_and_strengths_of_mutation(monkeypatch: pytest.MonkeyPatch) -> No
 def test_mutation_picks_agents_and_at_least_one(agents: int, probability: float) -> None:
     team = jnp.concatenate([head_with_padding()] * agents)
     mask = jnp.stack([MASK] * agents)
-    mutate = jax.jit(jax.vmap(partial(genetics.mutate, team, mask, 0.25, probability)))
+    mutate = jax.jit(jax.vmap(partial(genetics.mutate, team, mask, 0.25, probability, draw="row")))
     mutated = np.asarray(mutate(KEYS))
     picked = (mutated != np.asarray(team)).any(axis=(2, 3))
     assert picked.any(axis=1).all()
@@ -240,7 +285,11 @@ def test_each_team_but_the_elite_mutates_with_the_probability(
     mask, elite = jnp.array([[True, True, False], [True, False, False]]), jnp.int32(1)
 
     mutate = jax.jit(
-        jax.vmap(partial(genetics.mutate_population, heads, elite, mask, 0.25, probability, 0.5))
+        jax.vmap(
+            partial(
+                genetics.mutate_population, heads, elite, mask, 0.25, probability, 0.5, draw="row"
+            )
+        )
     )
     mutated = np.asarray(mutate(KEYS[:1000]))
     changed = mutated != np.asarray(heads)

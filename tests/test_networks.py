@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from float64_factored import normal
 
 from race.networks import (
     act,
@@ -18,6 +19,7 @@ from race.networks import (
     init_mine,
     init_policy_embedding,
     mine_scores,
+    normalise,
 )
 from race.types import EnvSpec
 
@@ -32,9 +34,9 @@ def float64(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), tree)
 
 
-@pytest.fixture(scope="module")
-def encoder(tiny_spec: EnvSpec) -> Any:
-    return init_encoder(jax.random.key(0), tiny_spec, (5, H))
+@pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])
+def encoder(request: Any, tiny_spec: EnvSpec) -> Any:
+    return init_encoder(jax.random.key(0), tiny_spec, (5, H), request.param)
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +49,20 @@ def state() -> jax.Array:
     return jax.random.normal(jax.random.key(2), (B, 4))
 
 
+def test_normalised_layers_have_mean_0_and_variance_1_whatever_their_scale() -> None:
+    x = jax.random.normal(jax.random.key(3), (2, B, 50)) * jnp.array([1e-1, 1e3])[:, None, None]
+    for shifted in (x, x + 7.0):
+        y = np.asarray(jax.jit(normalise)(shifted), np.float64)
+        np.testing.assert_allclose(y.mean(axis=-1), 0.0, atol=1e-3)
+        np.testing.assert_allclose(y.var(axis=-1), 1.0, rtol=2e-3)
+
+
+def test_normalisation_of_equal_entries_is_finite_and_so_is_its_gradient() -> None:
+    value, slope = jax.value_and_grad(lambda x: jnp.sum(jnp.square(normalise(x))))(jnp.ones(5))
+    assert value == 0
+    assert jnp.isfinite(slope).all()
+
+
 def test_encoders_see_their_own_observation(
     tiny_spec: EnvSpec, encoder: Any, state: jax.Array
 ) -> None:
@@ -56,8 +72,9 @@ def test_encoders_see_their_own_observation(
         for b in range(B):
             obs = s[b, list(entries)]
             w = weights.hidden.weight[agent][: len(obs)]
-            x = np.tanh(obs @ w + weights.hidden.bias[agent])
-            x = np.tanh(x @ weights.out.weight[agent] + weights.out.bias[agent])
+            x = np.tanh(normal(weights, obs @ w + weights.hidden.bias[agent]))
+            x = x @ weights.out.weight[agent] + weights.out.bias[agent]
+            x = np.tanh(normal(weights, x))
             np.testing.assert_allclose(z[agent, b], x, rtol=1e-5, atol=1e-6)
 
 
@@ -111,7 +128,7 @@ def test_initial_ranges_and_no_two_agents_alike() -> None:
     spec = EnvSpec(
         "wide", 100, (tuple(range(100)), (0, 1, 2, 3)), ((0,), (1,)), (-1.0,) * 2, (1.0,) * 2, 5
     )
-    fresh = init_encoder(jax.random.key(0), spec, (300, 200))
+    fresh = init_encoder(jax.random.key(0), spec, (300, 200), False)
     # The range follows from an agent's own observation entries, not from the padded ones.
     for agent, fan_in in enumerate((100, 4)):
         rows = np.asarray(fresh.hidden.weight[agent, :fan_in])

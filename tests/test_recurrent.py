@@ -23,10 +23,10 @@ L, B, N, OBS, A, H = 5, 2, 3, 4, 6, 5
 ROWS = 3
 
 
-@pytest.fixture(scope="module")
-def encoder() -> GruEncoder:
+@pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])
+def encoder(request: Any) -> GruEncoder:
     """With larger weights than fresh ones, so that gates open and close."""
-    fresh = init_gru_encoder(jax.random.key(0), OBS, A, N, H)
+    fresh = init_gru_encoder(jax.random.key(0), OBS, A, N, H, request.param)
     larger: GruEncoder = jax.tree.map(lambda x: 3.0 * x, fresh)
     return larger
 
@@ -188,7 +188,7 @@ def test_episodes_that_lie_end_to_end_do_not_remember_each_other(
 
 def test_initial_ranges() -> None:
     """All inputs of the first layer count: what is seen, the last action, and the number."""
-    fresh = init_gru_encoder(jax.random.key(2), 20, 9, 7, 64)
+    fresh = init_gru_encoder(jax.random.key(2), 20, 9, 7, 64, False)
     for weights, inputs in (
         (fresh.obs.weight, 36),
         (fresh.obs.bias, 36),

@@ -89,7 +89,9 @@ def small(
         task,
         env_steps=90,
         facmac=dataclasses.replace(settings, **(facmac or {})),
-        race=RaceConfig(policy_embedding_size=3, mine_size=5, population_size=TEAMS - 1),
+        race=RaceConfig(
+            policy_embedding_size=3, mine_size=5, population_size=TEAMS - 1, elite_copy=False
+        ),
         evaluation=EvaluationConfig(every=40, episodes=3),
         checkpoint=CheckpointConfig(minutes=0.0, keep=2),
     )

@@ -48,19 +48,20 @@ def random_batch() -> Episode:
     return Episode(*typed, np.array(LENGTHS, np.int32))
 
 
-def tiny_facmac(tiny_config: Callable[..., Config]) -> Config:
+def tiny_facmac(tiny_config: Callable[..., Config], layer_norm: bool = False) -> Config:
     """RACE over FACMAC with tiny networks, all of unequal sizes."""
     facmac = FacmacConfig(
         mixer_size=3,
         hypernet_size=4,
         hidden_size=H,
+        layer_norm=layer_norm,
         utility_sizes=(6, 5),
         gradient_clip=1e6,
         discount=0.9,
         td_lambda=0.7,
         target_update_every=TARGET_EVERY,
     )
-    tiny = tiny_config("race", "facmac", race={"population_size": 4})
+    tiny = tiny_config("race", "facmac", race={"population_size": 4, "elite_copy": False})
     return dataclasses.replace(tiny, discrete=True, facmac=facmac)
 
 

@@ -122,7 +122,7 @@ def evolve(
     assert race.mutation_fraction is not None
     select_key, breed_key, mutate_key = jax.random.split(key, 3)
     chosen = select(fitness, race.tournament_size, select_key)
-    heads = breed(state.heads, chosen, breed_key)
+    heads = breed(state.heads, chosen, breed_key, race.elite_copy)
     heads = mutate_population(
         heads,
         chosen.elite,
@@ -131,6 +131,7 @@ def evolve(
         race.mutation_probability,
         race.agent_mutation_probability,
         mutate_key,
+        race.mutation_draw,
     )
     is_elite = state.injected == chosen.elite
     is_parent = state.injected == chosen.parent

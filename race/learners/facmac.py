@@ -46,8 +46,10 @@ class Moments(NamedTuple):
 
 def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> GruEncoder:
     """A fresh encoder, one for all agents."""
-    size = config.facmac.hidden_size
-    return init_gru_encoder(key, spec.obs_size, spec.n_actions, spec.n_agents, size)
+    facmac = config.facmac
+    return init_gru_encoder(
+        key, spec.obs_size, spec.n_actions, spec.n_agents, facmac.hidden_size, facmac.layer_norm
+    )
 
 
 def new_head(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Float[Array, "1 H1 A"]:
@@ -70,7 +72,12 @@ def new_critic(
     facmac = config.facmac
     return FactoredCritic(
         factored.init_utilities(
-            utility_key, spec.obs_size, spec.n_actions, facmac.utility_sizes, further_inputs
+            utility_key,
+            spec.obs_size,
+            spec.n_actions,
+            facmac.utility_sizes,
+            facmac.layer_norm,
+            further_inputs,
         ),
         factored.init_mixer(
             mixer_key,

@@ -30,6 +30,7 @@ def new_critic(
             obs_size,
             action_size,
             config.learner.hidden_sizes,
+            config.learner.layer_norm,
             further_inputs,
             padding=obs_size + action_size - obs - action,
         )

@@ -7,20 +7,19 @@ the other two of TD3's additions away.
 from jaxtyping import PRNGKeyArray
 
 from race.config import Config
-from race.critics import Critic, Pevfa, init_critic, init_pevfa
-from race.learners.matd3 import matd3
+from race.critics import Critic, Pevfa
+from race.learners.matd3 import critics_of, matd3, pevfas_of
 from race.types import EnvSpec
 
 
 def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Critic:
     """A fresh critic, an ensemble of one."""
-    return init_critic(key, spec, config.learner.hidden_sizes, 1)
+    return critics_of(key, spec, config, 1)
 
 
 def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Pevfa:
     """A fresh PeVFA, an ensemble of one."""
-    size = config.race.policy_embedding_size
-    return init_pevfa(key, spec, config.learner.hidden_sizes, 1, size)
+    return pevfas_of(key, spec, config, 1)
 
 
 maddpg = matd3._replace(init_critic=new_critic, init_pevfa=new_pevfa)

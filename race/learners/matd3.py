@@ -26,7 +26,7 @@ N_CRITICS = 2
 
 def new_encoder(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Encoder:
     """Fresh encoders of all agents."""
-    return networks.init_encoder(key, spec, config.learner.hidden_sizes)
+    return networks.init_encoder(key, spec, config.learner.hidden_sizes, config.learner.layer_norm)
 
 
 def new_head(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Float[Array, "N H1 A"]:
@@ -34,15 +34,26 @@ def new_head(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Float[Array, "
     return networks.init_head(key, spec, config.learner.hidden_sizes[1])
 
 
+def critics_of(key: PRNGKeyArray, spec: EnvSpec, config: Config, count: int) -> Critic:
+    """A fresh ensemble."""
+    learner = config.learner
+    return critics.init_critic(key, spec, learner.hidden_sizes, count, learner.layer_norm)
+
+
+def pevfas_of(key: PRNGKeyArray, spec: EnvSpec, config: Config, count: int) -> Pevfa:
+    """A fresh ensemble of PeVFAs over one policy embedding."""
+    learner, size = config.learner, config.race.policy_embedding_size
+    return critics.init_pevfa(key, spec, learner.hidden_sizes, count, learner.layer_norm, size)
+
+
 def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Critic:
     """A fresh twin critic."""
-    return critics.init_critic(key, spec, config.learner.hidden_sizes, N_CRITICS)
+    return critics_of(key, spec, config, N_CRITICS)
 
 
 def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Pevfa:
     """A fresh twin PeVFA."""
-    size = config.race.policy_embedding_size
-    return critics.init_pevfa(key, spec, config.learner.hidden_sizes, N_CRITICS, size)
+    return pevfas_of(key, spec, config, N_CRITICS)
 
 
 def new_value(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> StateValue:

@@ -54,9 +54,9 @@ from race.algorithms.marl import Targets as MarlTargets
 from race.config import Config
 
 
-@pytest.fixture(scope="module")
-def config(tiny_config: Callable[..., Config]) -> Config:
-    return tiny_facmac(tiny_config)
+@pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])
+def config(request: Any, tiny_config: Callable[..., Config]) -> Config:
+    return tiny_facmac(tiny_config, layer_norm=request.param)
 
 
 class Explained(NamedTuple):

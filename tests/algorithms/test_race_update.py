@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from float64_factored import q_tot, q_tot_team
+from float64_factored import normal, q_tot, q_tot_team
 
 from race.algorithms import marl, race
 from race.algorithms.marl import MarlState
@@ -40,8 +40,9 @@ def sp(x: float) -> float:
 
 def z_of(encoder: Any, spec: EnvSpec, s: np.ndarray, agent: int) -> np.ndarray:
     obs = s[list(spec.obs_index[agent])]
-    x = np.tanh(obs @ encoder.hidden.weight[agent][: len(obs)] + encoder.hidden.bias[agent])
-    return np.tanh(x @ encoder.out.weight[agent] + encoder.out.bias[agent])
+    x = obs @ encoder.hidden.weight[agent][: len(obs)] + encoder.hidden.bias[agent]
+    x = np.tanh(normal(encoder, x)) @ encoder.out.weight[agent] + encoder.out.bias[agent]
+    return np.tanh(normal(encoder, x))
 
 
 def pi(encoder: Any, head: np.ndarray, spec: EnvSpec, s: np.ndarray) -> np.ndarray:
@@ -57,8 +58,14 @@ def q_psi(critic: Any, k: int, spec: EnvSpec, s: np.ndarray, u: np.ndarray) -> f
     if isinstance(critic, FactoredCritic):
         assert k == 0
         return q_tot(critic, spec, s, u)
-    x = leaky(np.concatenate([s, u]) @ critic.first.weight[k] + critic.first.bias[k])
-    x = leaky(x @ critic.hidden.weight[k] + critic.hidden.bias[k])
+    x = np.concatenate([s, u]) @ critic.first.weight[k] + critic.first.bias[k]
+    return rest_of_critic(critic, k, x)
+
+
+def rest_of_critic(critic: Any, k: int, x: np.ndarray) -> float:
+    """What follows the first layer's sum."""
+    x = leaky(normal(critic, x)) @ critic.hidden.weight[k] + critic.hidden.bias[k]
+    x = leaky(normal(critic, x))
     return float((x @ critic.out.weight[k] + critic.out.bias[k])[0])
 
 
@@ -82,9 +89,7 @@ def q_theta(
     critic = pevfa.critic
     first = np.concatenate([critic.first.weight[k], pevfa.embedding_weight[k]])
     x = np.concatenate([s, u, embedding(pevfa, spec, head)])
-    x = leaky(x @ first + critic.first.bias[k])
-    x = leaky(x @ critic.hidden.weight[k] + critic.hidden.bias[k])
-    return float((x @ critic.out.weight[k] + critic.out.bias[k])[0])
+    return rest_of_critic(critic, k, x @ first + critic.first.bias[k])
 
 
 def v_zeta(value: Any, s: np.ndarray) -> float:
@@ -266,7 +271,11 @@ def drawn_team(before: Any, pevfa_loss_seen: float, f: Frozen) -> np.ndarray:
     return team
 
 
-@pytest.fixture(scope="module", params=["matd3", "maddpg", "facmac"])
+@pytest.fixture(
+    scope="module",
+    params=[*((base, True) for base in ("matd3", "maddpg", "facmac")), ("matd3", False)],
+    ids=lambda param: f"{param[0]}-{'normalised' if param[1] else 'plain'}",
+)
 def stepped(
     request: Any,
     tiny_spec: EnvSpec,
@@ -274,7 +283,8 @@ def stepped(
     batch_of: Callable[..., Any],
     compiled: Callable[..., Any],
 ) -> Step:
-    config = tiny_config("race", request.param)
+    base, layer_norm = request.param
+    config = tiny_config("race", base, learner={"layer_norm": layer_norm})
     before = separate(race.init(jax.random.key(11), tiny_spec, config))
     batch = batch_of(tiny_spec, B)
     after, critic_losses, policy_losses = compiled(race, "update", tiny_spec, config)(
@@ -286,7 +296,7 @@ def stepped(
         float64(batch),
         float64(before.target),
         np.zeros(()),
-        2 if request.param == "matd3" else 1,
+        2 if base == "matd3" else 1,
         config.learner.discount,
         (zero, zero),
     )
@@ -450,7 +460,8 @@ def stepped_alone(
 ) -> Any:
     """One step of the learner without a population, from the same networks and minibatch."""
     spec, b = stepped.frozen.spec, stepped.before
-    config = tiny_config("marl", stepped.config.base)
+    plain = {"layer_norm": stepped.config.learner.layer_norm}
+    config = tiny_config("marl", stepped.config.base, learner=plain)
     state = MarlState(
         b.policies.encoder,
         b.policies.head,

@@ -52,9 +52,9 @@ B = (SIZE - 1) * ROWS
 KEY = jax.random.key(4)
 
 
-@pytest.fixture(scope="module")
-def config(tiny_config: Callable[..., Config]) -> Config:
-    return tiny_facmac(tiny_config)
+@pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])
+def config(request: Any, tiny_config: Callable[..., Config]) -> Config:
+    return tiny_facmac(tiny_config, layer_norm=request.param)
 
 
 class Networks:

@@ -36,7 +36,7 @@ def config_of(task: str, n_population: int = 4, **facmac: Any) -> Config:
             task,
             env_steps=200,
             facmac=FacmacConfig(**settings),
-            race=RaceConfig(population_size=n_population),
+            race=RaceConfig(population_size=n_population, elite_copy=False),
         ),
         discrete=True,
     )
