@@ -1,5 +1,6 @@
 """Encoders, heads, policy embedding and MINE against explicit loops in float64."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -105,7 +106,8 @@ def test_padding_changes_nothing(
 ) -> None:
     # Agent 1 has no third observation entry, agent 0 no second action entry.
     junk = encoder.hidden.weight.at[1, 2].set(1e3)
-    spoiled = type(encoder)(type(encoder.hidden)(junk, encoder.hidden.bias), encoder.out)
+    hidden = type(encoder.hidden)(junk, encoder.hidden.bias)
+    spoiled = dataclasses.replace(encoder, hidden=hidden)
     z = encode(encoder, tiny_spec, state)
     assert jnp.array_equal(encode(spoiled, tiny_spec, state), z)
     spoiled_head = head.at[0, :, 1].set(1e3)

@@ -143,7 +143,7 @@ def test_agents_have_memories_of_their_own_and_differ_by_number(
 
 def test_each_last_action_adds_its_row_and_none_adds_nothing(encoder: GruEncoder) -> None:
     """Where the first layer passes everything on, inputs of gates are linear in its rows."""
-    linear = dataclasses.replace(encoder, agent=jnp.full((N, H), 100.0))
+    linear = dataclasses.replace(encoder, agent=jnp.full((N, H), 100.0), layer_norm=False)
     obs = jnp.zeros((N, OBS))
 
     def inputs(last: int) -> np.ndarray:

@@ -205,7 +205,9 @@ def with_junk_in_padding(case: Case) -> Any:
 
     def spoil_encoder(encoder: Any) -> Any:
         weight = jnp.where(obs_rows[:, :, None], 1e3, encoder.hidden.weight)
-        return type(encoder)(type(encoder.hidden)(weight, encoder.hidden.bias), encoder.out)
+        return dataclasses.replace(
+            encoder, hidden=type(encoder.hidden)(weight, encoder.hidden.bias)
+        )
 
     def spoil_critic(critic: Any) -> Any:
         """The factored critic alone has inputs that are padded."""

@@ -1,5 +1,6 @@
 """FACMAC's factored critic on continuous actions, against the same in float64."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -160,9 +161,7 @@ def test_padding_changes_nothing(
     # Agent 1 has no third observation entry, agent 0 no second action entry.
     first = critic.utilities.first
     weight = first.weight.at[1, 2].set(1e3).at[0, 4].set(1e3)
-    spoiled = type(critic.utilities)(
-        type(first)(weight, first.bias), critic.utilities.hidden, critic.utilities.out
-    )
+    spoiled = dataclasses.replace(critic.utilities, first=type(first)(weight, first.bias))
     q = facmac.q_marl(critic, *inputs, tiny_spec)
     assert jnp.array_equal(
         facmac.q_marl(type(critic)(spoiled, critic.mixer), *inputs, tiny_spec), q
@@ -198,7 +197,7 @@ def test_utilities_shift_is_a_bias(critic: Any) -> None:
     inputs = jax.random.normal(jax.random.key(5), (2, B, 5))
     shift = jax.random.normal(jax.random.key(6), (2, 5))
     first = type(net.first)(net.first.weight, net.first.bias + shift)
-    shifted = type(net)(first, net.hidden, net.out)
+    shifted = dataclasses.replace(net, first=first)
     np.testing.assert_allclose(
         utility_values(net, inputs, shift), utility_values(shifted, inputs), rtol=1e-5, atol=1e-6
     )
