@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from race import __version__
-from race.metadata import DISTRIBUTION
-from race.rendering import PACKAGES, choose_renderer
+from race.runs.metadata import DISTRIBUTION
+from race.viewing.rendering import PACKAGES, choose_renderer
 
 Status = Literal["ok", "warning", "missing"]
 
@@ -95,7 +95,7 @@ def _accelerator() -> Finding:
 
 
 def _physics() -> Finding:
-    from race.config import EnvConfig
+    from race.config.settings import EnvConfig
     from race.envs import make_task
 
     task = make_task("mamujoco/Hopper-3x1", EnvConfig())

@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses, Teams
-from race.config import Config
+from race.config.settings import Config
 from race.learners import LEARNERS
-from race.networks import act_teams
-from race.replay import Layout, Replay, distinct_places, insert, sample, slots_of
+from race.networks.dense import act_teams
+from race.replay.buffer import Layout, Replay, distinct_places, insert, sample, slots_of
 from race.types import EnvSpec, Spec
 
 TRACES: Counter[str] = Counter()

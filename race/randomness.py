@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from numpy.typing import NDArray
 
-from race.config import Config
+from race.config.settings import Config
 
 
 class Purpose(IntEnum):

@@ -79,8 +79,8 @@ def tiny_config() -> Callable[..., Any]:
     Targets are not smoothed and gradients not clipped, so that losses can be worked out; all
     teams enter the tournament, so that fates can be scripted.
     """
-    from race.config import Config, FacmacConfig, LearnerConfig, RaceConfig
-    from race.presets import resolve
+    from race.config.presets import resolve
+    from race.config.settings import Config, FacmacConfig, LearnerConfig, RaceConfig
 
     def make(
         algo: str = "race",

@@ -1,7 +1,7 @@
 """The factored critic written a second time: one sample, in float64, without padding.
 
-From the docstrings of `race.factored`: utilities of ReLU layers, hypernetworks of two ReLU layers,
-and a policy embedding as further inputs of every first layer.
+From the docstrings of `race.networks.factored`: utilities of ReLU layers, hypernetworks of two ReLU
+layers, and a policy embedding as further inputs of every first layer.
 """
 
 from typing import Any

@@ -7,7 +7,7 @@ import pytest
 
 from race import doctor
 from race.doctor import examine
-from race.rendering import Renderer
+from race.viewing.rendering import Renderer
 
 
 def test_a_healthy_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from race.algorithms import race
-from race.config import Config, FacmacConfig
+from race.config.settings import Config, FacmacConfig
 from race.types import DiscreteSpec, Episode, Slots
 
 N, OBS, S, A, H, E, T = 3, 5, 6, 4, 5, 4, 5

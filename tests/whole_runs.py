@@ -3,11 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-from race import metrics, run_directory
-from race.config import Config
-from race.run import Report, silent
-from race.run_state import Progress
-from race.trainer import train
+from race.config.settings import Config
+from race.runs import directory as run_directory
+from race.runs import metrics
+from race.training.run import Report, silent
+from race.training.run_state import Progress
+from race.training.trainer import train
 
 TIMES = ("wall_seconds", "time/env_steps_per_second", "time/rollout_fraction")
 

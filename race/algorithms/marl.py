@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, when
-from race.config import Config
-from race.equations import marl_policy_loss, td_loss
+from race.config.settings import Config
 from race.learners import learner_of
-from race.optimization import Trainable, copy, descend, init_trainable
+from race.method.equations import marl_policy_loss, td_loss
+from race.networks.optimization import Trainable, copy, descend, init_trainable
 from race.types import Spec
 
 

@@ -16,8 +16,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, when
-from race.config import Config
-from race.equations import (
+from race.config.settings import Config
+from race.learners import learner_of
+from race.learners.base import Samples
+from race.method.equations import (
     best_target,
     encoder_loss,
     marl_policy_loss,
@@ -28,10 +30,8 @@ from race.equations import (
     value_function_maximization_loss,
     value_weights,
 )
-from race.genetics import breed, inject, mutate_population, select
-from race.learners import learner_of
-from race.learners.base import Samples
-from race.optimization import copy, descend, init_trainable
+from race.method.genetics import breed, inject, mutate_population, select
+from race.networks.optimization import copy, descend, init_trainable
 from race.types import Spec
 
 

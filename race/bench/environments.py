@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from race.bench.measurement import Measurement, Subject
+from race.config.presets import TABLE_3
 from race.envs import make_continuous_task
-from race.presets import TABLE_3
 
 SECONDS = 1.0
 

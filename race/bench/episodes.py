@@ -12,16 +12,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from race import programs, run_directory
+from race import programs
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best
-from race.config import Algo, Config
-from race.packing import layouts
-from race.presets import resolve
-from race.replay import Replay
+from race.config.presets import resolve
+from race.config.settings import Algo, Config
+from race.replay.buffer import Replay
+from race.replay.packing import layouts
 from race.rollouts.episodes import empty_episode
-from race.run_state import Progress
-from race.trainer import train
+from race.runs import directory as run_directory
+from race.training.run_state import Progress
+from race.training.trainer import train
 from race.types import DiscreteSpec, Episode
 
 SHAPES: Final[dict[str, DiscreteSpec]] = {

@@ -54,7 +54,7 @@ def _bytes_of_transitions() -> int:
 
     from race import programs
     from race.bench.update import Updates, setting
-    from race.replay import init_replay
+    from race.replay.buffer import init_replay
     from race.rollouts.transitions import empty_transition
 
     # MATD3 compiles sooner than RACE and reads the buffer in the same loop.
@@ -76,10 +76,10 @@ def _bytes_of_episodes() -> int:
 
     from race import programs
     from race.bench.episodes import EpisodeUpdates, random_episodes
-    from race.config import Config
+    from race.config.presets import resolve
+    from race.config.settings import Config
     from race.envs import make_discrete_task
-    from race.presets import resolve
-    from race.replay import init_replay
+    from race.replay.buffer import init_replay
     from race.rollouts.episodes import empty_episode
 
     spec = make_discrete_task(f"micro/{MAP}").spec

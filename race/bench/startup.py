@@ -49,11 +49,11 @@ def _seconds_to_first_steps(folder: Path, environment: dict[str, str], run: str)
 
 def _train_until_first_steps(path: Path) -> None:
     # What `race train mamujoco/HalfCheetah-2x3 --run-dir DIR` does, with another report.
-    from race import run_directory
-    from race.cli.compilation import use_cache
-    from race.config import Config
-    from race.presets import resolve
-    from race.trainer import train
+    from race.compilation import use_cache
+    from race.config.presets import resolve
+    from race.config.settings import Config
+    from race.runs import directory as run_directory
+    from race.training.trainer import train
 
     def report(stage: str, progress: Any, row: dict[str, Any]) -> None:
         if "time/first_gradient_steps" in row:

@@ -9,13 +9,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from race import run_directory
 from race.bench.measurement import Measurement, Subject
 from race.bench.update import setting
-from race.config import Algo
-from race.generation import CHUNK
-from race.run_state import Progress
-from race.trainer import train
+from race.config.settings import Algo
+from race.runs import directory as run_directory
+from race.training.generation import CHUNK
+from race.training.run_state import Progress
+from race.training.trainer import train
 
 GOAL = 0.10
 GENERATIONS = 2
@@ -39,7 +39,7 @@ class _EnoughError(Exception):
 
 
 class _Stopwatch:
-    """A `race.run.Report` that notes when gradient steps were done."""
+    """A `race.training.run.Report` that notes when gradient steps were done."""
 
     def __init__(self) -> None:
         self._generations: list[list[float]] = []  # when each 100 steps of them were done

@@ -12,10 +12,10 @@ from race import programs
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best, seconds
 from race.bench.products import operations, products_alone, products_in
-from race.config import Algo, Config, LearnerConfig
+from race.config.presets import resolve
+from race.config.settings import Algo, Config, LearnerConfig
 from race.envs import make_continuous_task
-from race.presets import resolve
-from race.replay import Replay, sample
+from race.replay.buffer import Replay, sample
 from race.types import EnvSpec, Transition
 
 ROUNDS = 6

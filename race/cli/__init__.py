@@ -1,4 +1,7 @@
-"""The command line: ``race COMMAND ...``. Each command is a module of this package."""
+"""The command line: ``race COMMAND ...``. Each command is a module of this package.
+
+A command is added as a module with `main` and a line in `COMMANDS`; nothing below imports it.
+"""
 
 import difflib
 import importlib

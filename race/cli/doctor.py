@@ -20,7 +20,7 @@ def main(arguments: list[str]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from race.cli.compilation import cache_directory
+    from race.compilation import cache_directory
     from race.doctor import examine
 
     console = Console()

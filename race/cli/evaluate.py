@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from race.config import TeamName
+from race.config.settings import TeamName
 from race.errors import ConfigError
 
 BATCH = 32
@@ -46,11 +46,11 @@ def main(arguments: list[str]) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
-    from race.cli.compilation import use_cache
     from race.cli.progress import rounded
+    from race.compilation import use_cache
     from race.rollouts import rollouts_of
     from race.rollouts.base import Score
-    from race.trained import load_trained
+    from race.teams.trained import load_trained
 
     use_cache()
     trained = load_trained(chosen.run_dir)

@@ -7,8 +7,8 @@ from typing import get_args
 
 import tyro
 
-from race.config import Algo
-from race.presets import PRESETS, TABLES
+from race.config.presets import PRESETS, TABLES
+from race.config.settings import Algo
 
 ALGORITHMS = {
     "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "

@@ -31,7 +31,7 @@ def main(arguments: list[str]) -> None:
     chosen = tyro.cli(Plot, args=arguments, prog="race plot")
     from race.cli.progress import rounded
     from race.errors import RunDirectoryError
-    from race.plotting import plot
+    from race.viewing.plotting import plot
 
     if not chosen.run_dirs:
         raise RunDirectoryError("Say which runs to draw: race plot DIR [DIR ...] --out curves.png")

@@ -8,13 +8,13 @@ from rich.console import Console
 from rich.progress import BarColumn, SpinnerColumn, TaskID, TextColumn
 from rich.progress import Progress as Bar
 
-from race.config import Config
-from race.run_state import Progress
+from race.config.settings import Config
+from race.training.run_state import Progress
 
 
 @final
 class TrainingDisplay:
-    """Shows the progress of one run; pass `report` to `race.trainer.train`."""
+    """Shows the progress of one run; pass `report` to `race.training.trainer.train`."""
 
     def __init__(self, config: Config, console: Console) -> None:
         self._config = config
@@ -49,7 +49,7 @@ class TrainingDisplay:
         self._bar.stop()
 
     def report(self, stage: str, progress: Progress, row: dict[str, Any]) -> None:
-        """A `race.run.Report`."""
+        """A `race.training.run.Report`."""
         if progress.gradient_steps == 0 and stage == "learning" and not row:
             stage = "compiling"
         covered = _covered(progress, self._config)

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
-from race.config import TeamName
+from race.config.settings import TeamName
 from race.errors import ConfigError, RenderError, blamed
 
 PolicyName = Literal["scripted", "random"]
@@ -84,7 +84,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         raise ConfigError(f"The --seed of a battle must be below {2**32}.")
     from rich.console import Console
 
-    from race.cli.compilation import use_cache
+    from race.compilation import use_cache
     from race.envs.micro import make
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
@@ -106,20 +106,20 @@ def _render_run(chosen: Render, out: Path) -> None:
         )
     from rich.console import Console
 
-    from race import run_directory
-    from race.cli.compilation import use_cache
+    from race.compilation import use_cache
+    from race.runs import directory as run_directory
 
     console = Console(stderr=True)
     discrete = run_directory.open_run(Path(chosen.what)).discrete
     renderer = None
     if not discrete:
         # mujoco reads what is chosen here when it is imported.
-        from race.rendering import choose_renderer
+        from race.viewing.rendering import choose_renderer
 
         with console.status("looking for a renderer"):
             renderer = choose_renderer()
         console.print(f"Drawing with: {renderer.reason}", highlight=False, soft_wrap=True)
-    from race.trained import load_trained
+    from race.teams.trained import load_trained
 
     use_cache()
     with console.status("loading the team"):
@@ -143,7 +143,7 @@ class _Drawn(NamedTuple):
 
 
 def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> _Drawn:
-    from race.rendering import Episode
+    from race.viewing.rendering import Episode
 
     policy = trained.policy(chosen.team or "selected")
     episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
@@ -227,7 +227,7 @@ def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:
     from rich.progress import Progress
 
     from race.cli.progress import rounded
-    from race.rendering import write_video
+    from race.viewing.rendering import write_video
 
     with Progress(console=console, transient=True) as bar:
         drawing = bar.track(drawn.frames, total=drawn.total, description="drawing")

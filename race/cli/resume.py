@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from race.presets import resolve
+from race.config.presets import resolve
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Resume:
 def main(arguments: list[str]) -> None:
     """Parses the arguments and trains."""
     chosen = tyro.cli(Resume, args=arguments, prog="race resume")
-    from race import run_directory
     from race.cli.training import run
+    from race.runs import directory as run_directory
 
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:

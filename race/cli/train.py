@@ -8,7 +8,8 @@ from typing import Annotated, Any
 
 import tyro
 
-from race.config import (
+from race.config.presets import PRESETS, resolve
+from race.config.settings import (
     Algo,
     Base,
     CheckpointConfig,
@@ -21,7 +22,6 @@ from race.config import (
     RaceConfig,
 )
 from race.errors import ConfigError
-from race.presets import PRESETS, resolve
 from race.types import DiscreteTask
 
 
@@ -69,9 +69,9 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
-    from race import run_directory
     from race.cli.training import describe, run
     from race.envs import make_task
+    from race.runs import directory as run_directory
 
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)

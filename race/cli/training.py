@@ -8,10 +8,10 @@ from typing import Any
 from rich.console import Console
 
 from race.cli import seconds_since_start
-from race.cli.compilation import use_cache
 from race.cli.progress import TrainingDisplay
-from race.config import Config
-from race.trainer import is_over, train
+from race.compilation import use_cache
+from race.config.settings import Config
+from race.training.trainer import is_over, train
 from race.types import AnyTask, DiscreteTask
 
 

@@ -1,4 +1,7 @@
-"""Tasks: Multi-Agent MuJoCo, micromanagement battles, probes with known answers, and your own."""
+"""Tasks: Multi-Agent MuJoCo, micromanagement battles, probes with known answers, and your own.
+
+A family of tasks may be added or changed here; whoever trains sees `race.types.AnyTask` alone.
+"""
 
 import difflib
 import importlib
@@ -13,7 +16,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium
 import numpy as np
 
-from race.config import EnvConfig
+from race.config.settings import EnvConfig
 from race.envs import discrete_probe, mamujoco, probe
 from race.errors import TaskError, blamed
 from race.types import AnyTask, DiscreteTask, EnvSpec, Task

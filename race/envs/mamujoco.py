@@ -21,7 +21,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from race.config import EnvConfig
+from race.config.settings import EnvConfig
 from race.errors import ConfigError, TaskError
 from race.types import EnvSpec, Task
 

@@ -1,6 +1,9 @@
-"""Base MARL methods: what a team and its critic are, and how targets are made."""
+"""Base MARL methods: what a team and its critic are, and how targets are made.
 
-from race.config import Config
+A method is added as one more `Learner`; algorithms are written against that interface alone.
+"""
+
+from race.config.settings import Config
 from race.learners.base import Learner
 from race.learners.facmac import facmac
 from race.learners.facmac_continuous import facmac_continuous

@@ -15,16 +15,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race import critics, factored
-from race.config import Config
-from race.critics import StateValue
-from race.equations import mutual_information_signal
-from race.exploration import greedy, gumbel_softmax
-from race.factored import FactoredCritic, FactoredPevfa
+from race.config.settings import Config
 from race.learners.base import Learner, Samples
-from race.networks import Mine, init_one_head, init_one_mine
-from race.recurrent import GruEncoder, embed_episodes, init_gru_encoder
-from race.returns import lambda_returns
+from race.method.equations import mutual_information_signal
+from race.method.exploration import greedy, gumbel_softmax
+from race.method.returns import lambda_returns
+from race.networks import critics, factored
+from race.networks.critics import StateValue
+from race.networks.dense import Mine, init_one_head, init_one_mine
+from race.networks.factored import FactoredCritic, FactoredPevfa
+from race.networks.recurrent import GruEncoder, embed_episodes, init_gru_encoder
 from race.types import DiscreteSpec, Slots
 
 GROUP = 32

@@ -2,7 +2,7 @@
 
 Deterministic policies, transitions, and one utility network per agent, which sees what the agent
 observes and does; the utilities are mixed by a monotonic network of the state. As MADDPG it has one
-critic, no policy delay and no smoothing (`race.presets.resolve`).
+critic, no policy delay and no smoothing (`race.config.presets.resolve`).
 """
 
 import jax
@@ -10,11 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from race import factored
-from race.config import Config
-from race.factored import FactoredCritic, FactoredPevfa
+from race.config.settings import Config
 from race.learners.matd3 import matd3
-from race.networks import head_vectors, stack
+from race.networks import factored
+from race.networks.dense import head_vectors, stack
+from race.networks.factored import FactoredCritic, FactoredPevfa
 from race.types import EnvSpec
 
 

@@ -1,14 +1,14 @@
 """MADDPG: MATD3 with a single critic.
 
-`race.presets.resolve` sets the policy delay to 1 and the smoothing noise to 0 for it, which takes
-the other two of TD3's additions away.
+`race.config.presets.resolve` sets the policy delay to 1 and the smoothing noise to 0 for it, which
+takes the other two of TD3's additions away.
 """
 
 from jaxtyping import PRNGKeyArray
 
-from race.config import Config
-from race.critics import Critic, Pevfa
+from race.config.settings import Config
 from race.learners.matd3 import critics_of, matd3, pevfas_of
+from race.networks.critics import Critic, Pevfa
 from race.types import EnvSpec
 
 

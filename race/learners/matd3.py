@@ -12,13 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race import critics, networks
-from race.config import Config
-from race.critics import Critic, Pevfa, StateValue, first_critic, first_pevfa
-from race.equations import mutual_information_signal, td_target
+from race.config.settings import Config
 from race.learners.base import Learner, Samples
-from race.networks import Encoder, Mine, mine_scores
-from race.optimization import track
+from race.method.equations import mutual_information_signal, td_target
+from race.networks import critics
+from race.networks import dense as networks
+from race.networks.critics import Critic, Pevfa, StateValue, first_critic, first_pevfa
+from race.networks.dense import Encoder, Mine, mine_scores
+from race.networks.optimization import track
 from race.types import EnvSpec, Transition
 
 N_CRITICS = 2

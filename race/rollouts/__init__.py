@@ -1,6 +1,9 @@
-"""Teams playing episodes."""
+"""Teams playing episodes, on the host or in a compiled loop on the device.
 
-from race.config import Config
+How actions are chosen and experience collected may be changed here; training sees `Rollouts`.
+"""
+
+from race.config.settings import Config
 from race.rollouts.base import Rollouts
 from race.rollouts.discrete import EpisodeRollouts
 from race.rollouts.transitions import TransitionRollouts

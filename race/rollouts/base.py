@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
 from race.errors import DivergenceError
-from race.replay import Replay
+from race.replay.buffer import Replay
 
 Steps = Callable[[int], None]
 """Told how many environment steps have been made."""

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Teams
-from race.exploration import explore, greedy
 from race.learners.facmac import logits
-from race.recurrent import embed_step, no_memory
+from race.method.exploration import explore, greedy
+from race.networks.recurrent import embed_step, no_memory
 from race.types import Observation
 
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from race import programs
 from race.algorithms.base import Teams
-from race.config import Config
+from race.config.settings import Config
 from race.errors import DivergenceError
-from race.exploration import epsilon
+from race.method.exploration import epsilon
 from race.randomness import Purpose, host_seeds, root_key
-from race.replay import Replay, init_replay
+from race.replay.buffer import Replay, init_replay
 from race.rollouts import device
 from race.rollouts.base import Generation, Score, Steps, check_returns
 from race.rollouts.choosing import Exploration

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from race import programs
 from race.algorithms.base import Teams
-from race.config import Config
+from race.config.settings import Config
 from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds
-from race.replay import Replay, init_replay
+from race.replay.buffer import Replay, init_replay
 from race.rollouts.base import Generation, Score, Steps, check_returns
 from race.rollouts.host import EnvPool, collect
 from race.types import EnvSpec, Rollout, Task, Transition

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from race.algorithms import Algorithm, algorithm_of, marl, race
-from race.config import Config, LearnerConfig
+from race.config.settings import Config, LearnerConfig
 from race.types import EnvSpec
 
 ALGORITHMS = {"race": race, "marl": marl}

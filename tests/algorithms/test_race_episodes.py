@@ -51,7 +51,7 @@ from tiny_episodes import (
 from race.algorithms import marl, race
 from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
-from race.config import Config
+from race.config.settings import Config
 
 
 @pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])

@@ -27,8 +27,8 @@ from tiny_episodes import (
 )
 
 from race.algorithms import race
-from race.config import Config
-from race.replay import Layout, Replay, slots_of
+from race.config.settings import Config
+from race.replay.buffer import Layout, Replay, slots_of
 
 PLAIN = ("critic", "pevfa", "value", "policy", "vfm")
 """Losses that are means of what each step of a minibatch gives for itself."""

@@ -20,8 +20,8 @@ from float64_factored import normal, q_tot, q_tot_team
 from race.algorithms import marl, race
 from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
-from race.config import Config
-from race.factored import FactoredCritic, FactoredPevfa
+from race.config.settings import Config
+from race.networks.factored import FactoredCritic, FactoredPevfa
 from race.types import EnvSpec
 
 B = 3

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from race.envs.discrete_probe import PROBES, make_task
-from race.envs.discrete_probe.host import CLIMB_PAYOFFS, ProbeHost
+from race.envs.discrete_probe.host import ProbeHost
+from race.envs.discrete_probe.rules import CLIMB_PAYOFFS
 from race.errors import RenderError, TaskError
 
 MATCHING, MEMORY, CLIMB, LIVES = PROBES

@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from race.config import EnvConfig
+from race.config.presets import TABLE_3
+from race.config.settings import EnvConfig
 from race.envs import (
     describe_tasks,
     factorised,
@@ -17,7 +18,6 @@ from race.envs import (
 )
 from race.envs.micro import load_map, map_names
 from race.errors import TaskError
-from race.presets import TABLE_3
 from race.rollouts.host import EnvPool, collect
 from race.types import DiscreteTask, Task
 

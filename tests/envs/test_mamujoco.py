@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from race.config import EnvConfig
+from race.config.settings import EnvConfig
 from race.envs import make_task
 from race.envs.mamujoco import KNOWN_PARTITIONS
 from race.errors import ConfigError, TaskError

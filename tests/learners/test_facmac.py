@@ -40,10 +40,10 @@ from tiny_episodes import (
 )
 
 from race.algorithms.base import Teams
-from race.config import Config
-from race.factored import embedding_shifts, mix
+from race.config.settings import Config
 from race.learners import facmac
 from race.learners.facmac import Moments, logits
+from race.networks.factored import embedding_shifts, mix
 from race.rollouts.choosing import blank, choose
 from race.types import Episode, Observation
 

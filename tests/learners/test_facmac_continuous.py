@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from float64_factored import q_tot, q_tot_team
 
-from race.config import Config
-from race.factored import embedding_shifts, mix, utility_values
+from race.config.settings import Config
 from race.learners import facmac_continuous as facmac
-from race.networks import embed_policy, head_vectors
+from race.networks.dense import embed_policy, head_vectors
+from race.networks.factored import embedding_shifts, mix, utility_values
 from race.types import EnvSpec
 
 B = 6

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from race.config import Config, LearnerConfig
+from race.config.presets import resolve
+from race.config.settings import Config, LearnerConfig
 from race.learners import LEARNERS, facmac, learner_of
 from race.learners.base import Learner
 from race.learners.matd3 import smooth
-from race.presets import resolve
 from race.types import EnvSpec, Transition
 
 KEY = jax.random.key(9)

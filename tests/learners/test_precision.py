@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from race.algorithms import race
-from race.config import Config, FacmacConfig
+from race.config.presets import resolve
+from race.config.settings import Config, FacmacConfig
 from race.envs import make_discrete_task
-from race.equations import marl_policy_loss, td_loss
 from race.learners import facmac
-from race.packing import layouts
-from race.presets import resolve
-from race.replay import Layout, Replay, slots_of
+from race.method.equations import marl_policy_loss, td_loss
+from race.replay.buffer import Layout, Replay, slots_of
+from race.replay.packing import layouts
 from race.rollouts.device import play
 from race.types import Episode
 

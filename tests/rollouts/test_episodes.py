@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from race.algorithms.base import Teams
-from race.config import Config, FacmacConfig, RaceConfig
+from race.config.presets import resolve
+from race.config.settings import Config, FacmacConfig, RaceConfig
 from race.envs import make_discrete_task
 from race.errors import DivergenceError, TaskError
-from race.exploration import greedy
 from race.learners.facmac import logits, new_encoder
-from race.presets import resolve
-from race.recurrent import embed_episodes
+from race.method.exploration import greedy
+from race.networks.recurrent import embed_episodes
 from race.rollouts import device, discrete
 from race.rollouts.choosing import Exploration
 from race.rollouts.discrete import EpisodeRollouts

@@ -8,7 +8,8 @@ the agent takes the available one of the lowest number instead. They have no pic
 import functools
 from typing import Final
 
-from race.envs.discrete_probe.host import CLIMB_PAYOFFS, LIVES_STEPS, MEMORY_STEPS, WINS, ProbeHost
+from race.envs.discrete_probe.host import ProbeHost
+from race.envs.discrete_probe.rules import CLIMB_PAYOFFS, LIVES_STEPS, MEMORY_STEPS, WINS
 from race.envs.probe import ProbeInfo
 from race.envs.pymarl import pymarl_task
 from race.types import DeviceEnv, DiscreteTask

@@ -10,7 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from race.envs.discrete_probe.host import (
+from race.envs.discrete_probe.chance import (
+    draw_lives,
+    draw_lives_start,
+    draw_matching,
+    draw_memory,
+)
+from race.envs.discrete_probe.rules import (
     CLIMB_PAYOFFS,
     LIVES_AGENTS,
     LIVES_STEPS,
@@ -21,41 +27,6 @@ from race.envs.discrete_probe.host import (
 from race.types import DeviceEnv, Observation, Outcome
 
 Actions = Int[Any, "N"]
-
-
-# What is drawn, here and on the host.
-
-
-@jax.jit
-def draw_matching(key: Key[Array, ""]) -> tuple[Int[Array, "2"], Bool[Array, "2 A"]]:
-    """Cues, and actions that are blocked unless they are right."""
-    cue_key, block_key = jax.random.split(key)
-    cues = jax.random.randint(cue_key, (2,), 0, MATCHING_ACTIONS, jnp.int32)
-    return cues, jax.random.bernoulli(block_key, 0.5, (2, MATCHING_ACTIONS))
-
-
-@jax.jit
-def draw_memory(key: Key[Array, ""]) -> Int[Array, "2"]:
-    """Cues."""
-    return jax.random.randint(key, (2,), 0, 2, jnp.int32)
-
-
-@jax.jit
-def draw_lives(key: Key[Array, ""]) -> Int[Array, "N"]:
-    """Cues of a moment, for the dead as well."""
-    return jax.random.randint(key, (LIVES_AGENTS,), 1, 3, jnp.int32)
-
-
-@jax.jit
-def draw_lives_start(key: Key[Array, ""]) -> tuple[Int[Array, ""], Int[Array, "N"]]:
-    """Steps of the episode, and the first cues."""
-    length_key, cue_key = jax.random.split(key)
-    fewest, most = LIVES_STEPS
-    length = jax.random.randint(length_key, (), fewest, most + 1, jnp.int32)
-    return length, draw_lives(cue_key)
-
-
-# What happens.
 
 
 class MatchingState(NamedTuple):

@@ -1,8 +1,8 @@
 """The rules of the probes in plain Python, behind PyMARL's interface.
 
-Only chance comes from `race.envs.discrete_probe.device`; everything else is written a second time
-here, so that tests can compare the two. This module does not import jax before it is needed,
-which takes longer than a listing of the tasks.
+Chance comes from `race.envs.discrete_probe.chance`, as on the device; everything else is written a
+second time here, so that tests can compare the two. This module does not import jax before it is
+needed, which takes longer than a listing of the tasks.
 """
 
 from typing import Any, Final, Protocol, final
@@ -11,26 +11,16 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from race.envs.discrete_probe.rules import (
+    CLIMB_PAYOFFS,
+    LIVES_AGENTS,
+    LIVES_STEPS,
+    MATCHING_ACTIONS,
+    MEMORY_STEPS,
+    MEMORY_WAIT,
+    WINS,
+)
 from race.errors import TaskError
-
-WINS: Final = ("probe/memory",)
-"""Probes that can be won."""
-MATCHING_ACTIONS: Final = 4
-"""Actions, and thus cues, of ``probe/matching``."""
-MEMORY_STEPS: Final = 3
-"""Steps of ``probe/memory``."""
-MEMORY_WAIT: Final = 1
-"""The moment of ``probe/memory`` at which only action 0 is available."""
-CLIMB_PAYOFFS: Final = ((1.0, -1.0, -0.25), (-1.0, 0.0, 0.25), (0.0, 0.25, 0.5))
-"""Reward of ``probe/climb``; rows are the first agent's actions, columns the second's.
-
-Best are both 0. Both 2 are safe: no agent gains by leaving alone, and 2 is the best choice against
-a partner that plays at random.
-"""
-LIVES_AGENTS: Final = 3
-"""Agents of ``probe/lives``; agent i lives for its first i + 1 steps."""
-LIVES_STEPS: Final = (3, 5)
-"""Fewest and most steps of ``probe/lives``."""
 
 
 class _Rules(Protocol):
@@ -67,7 +57,7 @@ class _Matching:
         self._blocked = [[False] * self.n_actions] * self.n_agents
 
     def begin(self, now: Any) -> None:
-        cues, blocked = _device().draw_matching(now)
+        cues, blocked = _chance().draw_matching(now)
         self.cues, self._blocked = cues.tolist(), blocked.tolist()
         self.over = False
 
@@ -107,7 +97,7 @@ class _Memory:
         self._steps = 0
 
     def begin(self, now: Any) -> None:
-        self.cues = _device().draw_memory(now).tolist()
+        self.cues = _chance().draw_memory(now).tolist()
         self.over = self.won = False
         self._steps = 0
 
@@ -181,7 +171,7 @@ class _Lives:
         self._steps = 0
 
     def begin(self, now: Any) -> None:
-        length, cues = _device().draw_lives_start(now)
+        length, cues = _chance().draw_lives_start(now)
         self.length, self.cues = int(length), cues.tolist()
         self.over = False
         self._steps = 0
@@ -189,7 +179,7 @@ class _Lives:
     def play(self, actions: list[int], now: Any) -> float:
         living = [agent for agent in range(self.n_agents) if self._lives(agent)]
         right = [actions[agent] == self.cues[agent] for agent in living]
-        self.cues = _device().draw_lives(now).tolist()
+        self.cues = _chance().draw_lives(now).tolist()
         self._steps += 1
         self.over = self._steps == self.length
         return (_share(right) if living else 1.0) / self.length
@@ -310,10 +300,10 @@ class ProbeHost:
         return now
 
 
-def _device() -> Any:
-    from race.envs.discrete_probe import device
+def _chance() -> Any:
+    from race.envs.discrete_probe import chance
 
-    return device
+    return chance
 
 
 def _bits(number: int, size: int) -> list[float]:

@@ -1,0 +1,237 @@
+"""What values of a configuration can work."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from race.config.settings import Config, FacmacConfig
+from race.errors import ConfigError
+
+LARGEST_LAYER = 16_384
+"""Units of a layer, samples of a batch, teams: more is a slip of the hand."""
+MOST_TRANSITIONS = 2**30
+"""Transitions in a replay buffer, which counts them with 32 bits."""
+
+
+Rule = tuple[bool, str, Any, str]
+"""Whether it holds, the setting, its value, and what it must be."""
+
+
+def check(config: Config) -> None:
+    """Checks every value of a configuration whose presets are filled in.
+
+    Raises:
+        ConfigError: naming the first setting that cannot work, and what would.
+    """
+    learner, race, facmac = config.learner, config.race, config.facmac
+    assert config.evaluation.every is not None
+    assert config.evaluation.episodes is not None
+    if config.discrete and config.base != "facmac":
+        raise ConfigError(
+            f"{config.method} does not work on {config.task}: its actions are discrete, which "
+            "facmac alone learns to choose. Use --algo facmac, or --algo race with --base facmac."
+        )
+    assert race.mutation_fraction is not None
+    assert race.vmm_weight is not None
+    rules: list[Rule] = [
+        (1 <= config.env_steps < 2**31, "env-steps", config.env_steps, "from 1 to 2147483647"),
+        (
+            config.discrete or config.env_steps > learner.random_steps,
+            "env-steps",
+            config.env_steps,
+            f"more than the random steps before training (learner.random-steps "
+            f"{learner.random_steps})",
+        ),
+        (0 <= config.seed < 2**31, "seed", config.seed, "from 0 to 2147483647"),
+        (min(learner.hidden_sizes) >= 1, "learner.hidden-sizes", learner.hidden_sizes, "positive"),
+        (learner.batch_size >= 2, "learner.batch-size", learner.batch_size, "at least 2"),
+        (
+            learner.replay_capacity <= MOST_TRANSITIONS,
+            "learner.replay-capacity",
+            learner.replay_capacity,
+            f"at most {MOST_TRANSITIONS}",
+        ),
+        *(
+            (size <= LARGEST_LAYER, f"{name}", size, f"at most {LARGEST_LAYER}")
+            for name, size in (
+                ("learner.hidden-sizes", max(learner.hidden_sizes)),
+                ("learner.batch-size", learner.batch_size),
+                ("facmac.mixer-size", facmac.mixer_size),
+                ("facmac.hypernet-size", facmac.hypernet_size),
+                ("facmac.hidden-size", facmac.hidden_size),
+                ("facmac.utility-sizes", max(facmac.utility_sizes)),
+                ("facmac.value-size", facmac.value_size),
+                ("facmac.batch-size", facmac.batch_size),
+                ("race.policy-embedding-size", race.policy_embedding_size),
+                ("race.mine-size", race.mine_size),
+                ("race.population-size", race.population_size),
+                ("evaluation.episodes", config.evaluation.episodes),
+            )
+        ),
+        (
+            learner.batch_size <= learner.replay_capacity,
+            "learner.batch-size",
+            learner.batch_size,
+            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
+        ),
+        (
+            max(learner.random_steps, 1) <= learner.replay_capacity,
+            "learner.random-steps",
+            learner.random_steps,
+            f"no larger than the replay buffer (learner.replay-capacity {learner.replay_capacity})",
+        ),
+        (learner.random_steps >= 0, "learner.random-steps", learner.random_steps, "0 or more"),
+        (
+            learner.actor_learning_rate > 0,
+            "learner.actor-learning-rate",
+            learner.actor_learning_rate,
+            "above 0",
+        ),
+        (
+            learner.critic_learning_rate > 0,
+            "learner.critic-learning-rate",
+            learner.critic_learning_rate,
+            "above 0",
+        ),
+        (learner.gradient_clip > 0, "learner.gradient-clip", learner.gradient_clip, "above 0"),
+        (0 <= learner.discount < 1, "learner.discount", learner.discount, "in [0, 1)"),
+        (
+            0 < learner.target_update_rate <= 1,
+            "learner.target-update-rate",
+            learner.target_update_rate,
+            "in (0, 1]",
+        ),
+        (learner.policy_delay >= 1, "learner.policy-delay", learner.policy_delay, "at least 1"),
+        (
+            learner.exploration_noise >= 0,
+            "learner.exploration-noise",
+            learner.exploration_noise,
+            "0 or more",
+        ),
+        (
+            learner.smoothing_noise >= 0,
+            "learner.smoothing-noise",
+            learner.smoothing_noise,
+            "0 or more",
+        ),
+        (
+            learner.smoothing_clip >= 0,
+            "learner.smoothing-clip",
+            learner.smoothing_clip,
+            "0 or more",
+        ),
+        (
+            0 < learner.gradient_steps_per_env_step <= 100,
+            "learner.gradient-steps-per-env-step",
+            learner.gradient_steps_per_env_step,
+            "in (0, 100]",
+        ),
+        *_facmac_rules(facmac, config.n_teams),
+        (
+            race.population_size >= 4 + race.elite_copy,
+            "race.population-size",
+            race.population_size,
+            f"at least {4 + race.elite_copy}: an elite, a second parent, "
+            f"{'a copy of the elite, ' * race.elite_copy}a team for their offspring and one for "
+            f"the injected MARL team (for no population use --algo {config.base})",
+        ),
+        (
+            0 <= race.mutation_fraction <= 1,
+            "race.mutation-fraction",
+            race.mutation_fraction,
+            "in [0, 1]",
+        ),
+        (race.vmm_weight >= 0, "race.vmm-weight", race.vmm_weight, "0 or more"),
+        (
+            0 <= race.mutation_probability <= 1,
+            "race.mutation-probability",
+            race.mutation_probability,
+            "in [0, 1]",
+        ),
+        (
+            0 <= race.agent_mutation_probability <= 1,
+            "race.agent-mutation-probability",
+            race.agent_mutation_probability,
+            "in [0, 1]",
+        ),
+        (race.tournament_size >= 1, "race.tournament-size", race.tournament_size, "at least 1"),
+        (
+            race.policy_embedding_size >= 1,
+            "race.policy-embedding-size",
+            race.policy_embedding_size,
+            "at least 1",
+        ),
+        (race.mine_size >= 1, "race.mine-size", race.mine_size, "at least 1"),
+        (config.env.agent_obsk >= 0, "env.agent-obsk", config.env.agent_obsk, "0 or more"),
+        (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
+        (
+            config.evaluation.episodes >= 1,
+            "evaluation.episodes",
+            config.evaluation.episodes,
+            "at least 1",
+        ),
+        (
+            config.checkpoint.minutes >= 0,
+            "checkpoint.minutes",
+            config.checkpoint.minutes,
+            "0 or more",
+        ),
+        (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
+    ]
+    for holds, name, value, must in rules:
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
+        if not holds:
+            raise ConfigError(f"--{name} is {value}, but it must be {must}.")
+
+
+def _facmac_rules(facmac: FacmacConfig, n_teams: int) -> list[Rule]:
+    sizes: dict[str, Any] = {
+        "mixer-size": facmac.mixer_size,
+        "hypernet-size": facmac.hypernet_size,
+        "hidden-size": facmac.hidden_size,
+        "utility-sizes": facmac.utility_sizes,
+        "value-size": facmac.value_size,
+        "target-update-every": facmac.target_update_every,
+        "epsilon-steps": facmac.epsilon_steps,
+    }
+    positive = {
+        "actor-learning-rate": facmac.actor_learning_rate,
+        "critic-learning-rate": facmac.critic_learning_rate,
+        "gradient-clip": facmac.gradient_clip,
+    }
+    shares = {
+        "td-lambda": facmac.td_lambda,
+        "epsilon-start": facmac.epsilon_start,
+        "epsilon-finish": facmac.epsilon_finish,
+    }
+    rules: list[Rule] = [
+        (np.min(size) >= 1, name, size, "at least 1") for name, size in sizes.items()
+    ]
+    rules += [(rate > 0, name, rate, "above 0") for name, rate in positive.items()]
+    rules += [(0 <= share <= 1, name, share, "in [0, 1]") for name, share in shares.items()]
+    rules += [
+        (facmac.batch_size >= 2, "batch-size", facmac.batch_size, "at least 2"),
+        (
+            max(facmac.batch_size, n_teams) <= facmac.replay_capacity,
+            "replay-capacity",
+            facmac.replay_capacity,
+            f"at least a minibatch (facmac.batch-size {facmac.batch_size}) and an episode of each "
+            f"team ({n_teams})",
+        ),
+        (
+            facmac.replay_capacity <= MOST_TRANSITIONS,
+            "replay-capacity",
+            facmac.replay_capacity,
+            f"at most {MOST_TRANSITIONS}",
+        ),
+        (0 <= facmac.discount < 1, "discount", facmac.discount, "in [0, 1)"),
+        (
+            0 < facmac.gradient_steps_per_episode <= 100,
+            "gradient-steps-per-episode",
+            facmac.gradient_steps_per_episode,
+            "in (0, 100]",
+        ),
+    ]
+    return [(bool(holds), f"facmac.{name}", value, must) for holds, name, value, must in rules]

@@ -1,0 +1,140 @@
+"""Trained teams, read back from a run directory, ready to act."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, final
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike, NDArray
+
+from race.algorithms import algorithm_of
+from race.algorithms.base import Teams, tested_teams
+from race.config.settings import Config, TeamName
+from race.envs import make_task
+from race.errors import ConfigError, RunDirectoryError, TaskError
+from race.programs import act
+from race.rollouts.choosing import blank, choose
+from race.runs import checkpoints
+from race.runs import directory as run_directory
+from race.runs.directory import RunDirectory
+from race.training.run_state import Progress, learned_of, progress_of
+from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
+
+_choose = jax.jit(choose)
+
+
+class Trained(NamedTuple):
+    """The teams of a run's newest checkpoint."""
+
+    config: Config
+    task: AnyTask
+    progress: Progress
+    encoder: Any
+    heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and, with a population, "champion"
+
+    def resolve(self, team: TeamName) -> str:
+        """``marl`` or ``champion``: what ``selected`` stands for by the training returns.
+
+        Raises:
+            ConfigError: if the run has no such team.
+        """
+        name = self.progress.selected if team == "selected" else team
+        if name not in self.heads:
+            raise ConfigError(
+                f"A run of {self.config.method} has no population and so no champion; ask for "
+                "--team marl or --team selected, which are the same there."
+            )
+        return name
+
+    def policy(self, team: TeamName) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+        """The team as a function from a state [S] to a joint action [U] in [-1, 1].
+
+        Raises:
+            ConfigError: if the run has no such team, or its task has discrete actions.
+        """
+        if not isinstance(self.task, Task):
+            raise ConfigError(
+                f"{self.config.task} has discrete actions, and its teams remember: they are "
+                "played by recurrent_policy."
+            )
+        teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
+        spec, base = self.task.spec, str(self.config.base)
+
+        def joint_action(state: NDArray[np.float32]) -> NDArray[np.float32]:
+            return np.asarray(act(teams, state[None], spec=spec, base=base))[0]
+
+        return joint_action
+
+    def recurrent_policy(self, team: TeamName) -> "RecurrentPolicy":
+        """The team as it plays tasks with discrete actions.
+
+        Raises:
+            ConfigError: if the run has no such team, or its task has continuous actions.
+        """
+        if not isinstance(self.task, DiscreteTask):
+            raise ConfigError(f"{self.config.task} has continuous actions: call policy instead.")
+        head = self.heads[self.resolve(team)]
+        return RecurrentPolicy(Teams(self.encoder, head[None]), self.task.spec)
+
+
+@final
+class RecurrentPolicy:
+    """A team that chooses discrete actions and remembers what it saw. It does not explore.
+
+    Call `reset` before every further episode.
+    """
+
+    def __init__(self, teams: Teams, spec: DiscreteSpec) -> None:
+        self._teams, self._spec = teams, spec
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the episode."""
+        self._memory = blank(self._teams)
+
+    def __call__(self, obs: ArrayLike, avail_actions: ArrayLike) -> NDArray[np.int32]:
+        """The next actions of all agents [N], out of those available.
+
+        Args:
+            obs: what each agent observes now, [N, O].
+            avail_actions: which actions each can take, [N, A], at least one.
+
+        Raises:
+            TaskError: if an array has another shape.
+        """
+        spec = self._spec
+        arrays = np.array(obs, np.float32), np.array(avail_actions, bool)
+        sizes = (spec.n_agents, spec.obs_size), (spec.n_agents, spec.n_actions)
+        for name, array, size in zip(("obs", "avail_actions"), arrays, sizes, strict=True):
+            if array.shape != size:
+                raise TaskError(
+                    f"{name} of {spec.task} has the shape {size}; it was given {array.shape}."
+                )
+        # Teams choose by what agents observe; the state is for the learner alone.
+        state = np.zeros((1, spec.state_size), np.float32)
+        seen = Observation(arrays[0][None], state, arrays[1][None])
+        self._memory, action = _choose(self._teams, self._memory, seen, np.int32(0), None)
+        return np.asarray(action)[0]
+
+
+def load_trained(path: Path) -> Trained:
+    """The teams in the newest checkpoint of the run in ``path``.
+
+    Raises:
+        RunDirectoryError: if ``path`` holds no run, or one without a checkpoint.
+        CheckpointError: if the checkpoint is damaged.
+    """
+    config = run_directory.open_run(path)
+    newest = checkpoints.newest(RunDirectory(path).checkpoints)
+    if newest is None:
+        raise RunDirectoryError(
+            f"The run in {path} has no checkpoint yet. Wait for its first one, or go on with it: "
+            f"race resume {path}"
+        )
+    saved = checkpoints.load(newest, tables=False)
+    task, algorithm = make_task(config.task, config.env), algorithm_of(config)
+    state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
+    encoder, heads = tested_teams(algorithm, state, task.spec, config.has_population)
+    return Trained(config, task, progress_of(saved), encoder, heads)

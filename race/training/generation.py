@@ -1,0 +1,196 @@
+"""One generation of training: the paper's Algorithm 1, and the random steps before the first.
+
+Everything that changes is one `RunState`; each function maps it to the next.
+"""
+
+import math
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from race import programs
+from race.algorithms.base import tested_teams
+from race.errors import DivergenceError
+from race.randomness import Purpose, host_seeds, root_key
+from race.replay.buffer import Layout
+from race.replay.packing import layouts
+from race.training.clock import Clock
+from race.training.records import evaluation_row, generation_row
+from race.training.run import Run, save
+from race.training.run_state import RunState
+
+CHUNK = 100
+"""Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
+EPISODES_CHUNK = 12
+"""The same where each is made on whole episodes and takes far longer."""
+
+
+def warm_up(run: Run, state: RunState) -> RunState:
+    """Random episodes before the first generation, where the learner wants any.
+
+    If it is interrupted, the state stays as it was.
+
+    Raises:
+        DivergenceError: if the environment gives a reward or a state that is not finite.
+    """
+
+    def report(steps: int) -> None:
+        run.report("random steps", state.progress.but(env_steps=steps), {})
+
+    warm = run.rollouts.warm_up(state.replay, report, lambda: run.interrupts.requested)
+    if warm is None:
+        return state
+    replay, steps = warm
+    progress = state.progress.but(env_steps=steps, random_steps=steps)
+    return state._replace(replay=replay, progress=progress)
+
+
+def generation(run: Run, state: RunState, clock: Clock) -> RunState:
+    """One pass of Algorithm 1, or the rest of one that a checkpoint broke off.
+
+    Comments name the lines of Algorithm 1. An interrupt leaves the gradient steps half done.
+    """
+    if not state.progress.learning:
+        clock.begin()
+        state = roll_out(run, state)  # 3-6
+        state = evolve(run, state)  # 9
+        state = clock.rolled_out(state)
+    while _owed(run, state) > 0:
+        if run.interrupts.requested:
+            return state
+        state = learn(run, state)  # 8, 10, 13
+        if clock.checkpoint_due():
+            state = save(run, clock.stamp(state))
+    algorithm = run.algorithm.inject(state.algorithm)  # 11
+    state = state._replace(algorithm=algorithm, progress=state.progress.but(learning=False))
+    state = clock.stamp(state)
+    row = generation_row(run.config, run.algorithm, state)
+    run.metrics.write(row)
+    run.report("generation", state.progress, row)
+    state = state._replace(losses=programs.empty_losses(run.algorithm))
+    every, progress = run.config.evaluation.every, state.progress
+    assert every is not None
+    if (
+        progress.env_steps // every > progress.evaluated_at // every
+        or progress.env_steps >= run.config.env_steps
+    ):
+        state = test(run, state)
+        state = clock.stamp(state)
+    return state
+
+
+def roll_out(run: Run, state: RunState) -> RunState:
+    """Lines 3 to 6: every team plays one episode; all steps go to the replay buffer.
+
+    Raises:
+        DivergenceError: if a fitness or an action is not a finite number.
+    """
+    progress = state.progress
+    run.report("rollouts", progress, {})
+    teams = run.algorithm.teams(state.algorithm, run.task.spec)
+    replay, played = run.rollouts.play(teams, progress.generation, progress.env_steps, state.replay)
+    returns = played.episode_return.tolist()
+    progress = progress.but(
+        env_steps_before=progress.env_steps,
+        env_steps=progress.env_steps + played.env_steps,
+        episodes=progress.episodes + len(returns),
+        gradient_steps_before=progress.gradient_steps,
+        generation=progress.generation + 1,
+        fitness=tuple(returns[:-1]),
+        marl_return=returns[-1],
+        learning=True,
+    )
+    return state._replace(replay=replay, progress=progress)
+
+
+def evolve(run: Run, state: RunState) -> RunState:
+    """Line 9: the population evolves by the fitness just measured."""
+    if not run.config.has_population:
+        return state
+    fitness = jnp.asarray(state.progress.fitness, jnp.float32)
+    key = jax.random.fold_in(root_key(run.config, Purpose.EVOLUTION), state.progress.generation)
+    algorithm = programs.evolve(state.algorithm, fitness, key, **run.statics)
+    return state._replace(algorithm=algorithm)
+
+
+def learn(run: Run, state: RunState) -> RunState:
+    """Lines 8, 10 and 13: some of the gradient steps that the generation owes.
+
+    Raises:
+        DivergenceError: if a loss is not a finite number.
+    """
+    progress = state.progress
+    key, first = root_key(run.config, Purpose.LEARNING), np.int32(progress.gradient_steps)
+    if run.config.discrete:
+        # Where a generation's steps are parted depends on nothing but their number, so that a
+        # resumed run parts them alike.
+        count, laid = _minibatches(run, state, key)
+    else:
+        count, laid = min(CHUNK, _owed(run, state)), None
+    algorithm, losses = programs.learn(
+        state.algorithm,
+        state.losses,
+        state.replay,
+        key,
+        first,
+        np.int32(count),
+        **run.statics,
+        layouts=laid,
+    )
+    for name, value in losses.items():
+        if not math.isfinite(float(value)):
+            raise DivergenceError(
+                f"The {name} loss is no longer a finite number, between gradient steps "
+                f"{progress.gradient_steps} and {progress.gradient_steps + count} of generation "
+                f"{progress.generation}. Start a new run with smaller learning rates "
+                "(--learner.actor-learning-rate, --learner.critic-learning-rate, or of --facmac)."
+            )
+    if progress.gradient_steps == 0:
+        run.report(
+            "learning", progress, {"time/first_gradient_steps": time.perf_counter() - run.began}
+        )
+    progress = progress.but(gradient_steps=progress.gradient_steps + count)
+    run.report("learning", progress, {})
+    return state._replace(algorithm=algorithm, losses=losses, progress=progress)
+
+
+def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Layout]:
+    """The next gradient steps on episodes: how many, and how their minibatches are laid out."""
+    config = run.config
+    room = max(EPISODES_CHUNK, config.n_teams)
+    count = min(room, _owed(run, state))
+    first, shared = np.int32(state.progress.gradient_steps), run.statics["config"]
+    drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, config=shared)
+    places, lengths = (np.asarray(column)[:count] for column in drawn)
+    return count, layouts(places, lengths, run.task.spec.episode_limit, room)
+
+
+def _owed(run: Run, state: RunState) -> int:
+    progress, config = state.progress, run.config
+    if config.discrete:
+        # From the first full minibatch on.
+        learned_from = max(progress.episodes - config.facmac.batch_size + 1, 0)
+        due = math.floor(learned_from * config.facmac.gradient_steps_per_episode)
+    else:
+        learned_from = progress.env_steps - progress.random_steps
+        due = math.floor(learned_from * config.learner.gradient_steps_per_env_step)
+    return due - progress.gradient_steps
+
+
+def test(run: Run, state: RunState) -> RunState:
+    """Plays the test episodes and writes their row."""
+    config, progress = run.config, state.progress
+    run.report("evaluation", progress, {})
+    spec, episodes = run.task.spec, config.evaluation.episodes
+    assert episodes is not None
+    encoder, tested = tested_teams(run.algorithm, state.algorithm, spec, config.has_population)
+    seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, episodes)
+    scores = run.rollouts.test(encoder, tested, seeds)
+    row = evaluation_row(progress, scores)
+    progress = progress.but(evaluated_at=progress.env_steps)
+    run.metrics.write(row)
+    run.report("evaluation", progress, row)
+    return state._replace(progress=progress)

@@ -1,0 +1,60 @@
+"""The rows of ``metrics.jsonl``."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from race.algorithms import Algorithm
+from race.config.settings import Config
+from race.rollouts.base import Score
+from race.training.run_state import Progress, RunState
+
+
+def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dict[str, Any]:
+    """What a generation did: fitness, fate of injected teams, mean losses, speed.
+
+    Returns are those of training: the MARL team explores in them. Rates are those of the whole
+    run so far; they are None before the first injected team has met its fate.
+    """
+    progress = state.progress
+    steps = progress.gradient_steps - progress.gradient_steps_before
+    delay = config.policy_delay
+    policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
+    row: dict[str, Any] = {"kind": "generation", **_counters(progress)}
+    row["marl/return"] = progress.marl_return
+    if progress.fitness:
+        row["population/fitness_max"] = max(progress.fitness)
+        row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
+        row["population/fitness_min"] = min(progress.fitness)
+        fates = np.asarray(algorithm.injection_counts(state.algorithm)).tolist()
+        for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
+            row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
+    for name, total in state.losses.items():
+        count = policy_steps if name in algorithm.policy_losses else steps
+        row[f"loss/{name}"] = float(total) / count if count else None
+    env_steps = progress.env_steps - progress.env_steps_before
+    seconds = max(progress.generation_seconds, 1e-9)
+    row["time/env_steps_per_second"] = env_steps / seconds
+    row["time/rollout_fraction"] = progress.rollout_seconds / seconds
+    return row
+
+
+def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str, Any]:
+    """Test results of the MARL team, the champion, and the one of them that is selected.
+
+    Selected is the one with the better training return: no test result has a say in it.
+    """
+    row: dict[str, Any] = {"kind": "evaluation", **_counters(progress)}
+    for name, score in {**scores, "selected": scores[progress.selected]}.items():
+        row[f"eval/{name}/return_mean"] = score.mean
+        row[f"eval/{name}/return_std"] = score.std
+        row[f"eval/{name}/length_mean"] = float(score.lengths.mean())
+        if score.win_rate is not None:
+            row[f"eval/{name}/win_rate"] = score.win_rate
+    return row
+
+
+def _counters(progress: Progress) -> dict[str, Any]:
+    names = ("generation", "env_steps", "gradient_steps", "wall_seconds")
+    return {name: getattr(progress, name) for name in names}

@@ -1,0 +1,261 @@
+"""Frames of an episode, with whatever can draw on this machine, and video files of them."""
+
+import contextlib
+import functools
+import math
+import os
+import subprocess
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, final, get_args
+
+import gymnasium
+import imageio
+import numpy as np
+from numpy.typing import NDArray
+
+from race.errors import RenderError
+from race.rollouts.host import in_units
+from race.types import Task
+
+Backend = Literal["egl", "osmesa", "glfw", "sketch"]
+Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+PACKAGES = "apt-get install -y libegl1 libgl1-mesa-dri"
+"""What gives a Debian or Ubuntu machine OpenGL without a display."""
+
+SIZE = (480, 360)
+"""Width and height of frames in pixels."""
+
+_MOST_FRAMES_PER_SECOND = 30
+_PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string(
+    "<mujoco><worldbody><light pos='0 0 2'/><geom size='.2' rgba='1 0 0 1'/></worldbody></mujoco>"
+)
+data = mujoco.MjData(model)
+mujoco.mj_forward(model, data)
+renderer = mujoco.Renderer(model, 32, 32)
+renderer.update_scene(data)
+assert renderer.render().max() > 0
+print("drawn")
+"""
+
+
+class Renderer(NamedTuple):
+    """What draws MuJoCo here, and why."""
+
+    backend: Backend
+    reason: str
+
+
+@functools.cache
+def choose_renderer() -> Renderer:
+    """The first of EGL, OSMesa and, with a display, GLFW that draws; else the built-in one.
+
+    Each is tried in a process of its own, because a broken OpenGL can end the process. A
+    ``MUJOCO_GL`` that the user has set is tried alone. What is found is put into ``MUJOCO_GL``,
+    which mujoco reads when it is imported: choose before that.
+    """
+    offered: list[Backend] = ["egl", "osmesa"]
+    if os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"):
+        offered.append("glfw")
+    asked = os.environ.get("MUJOCO_GL", "").lower()
+    candidates = [b for b in get_args(Backend)[:-1] if b == asked] if asked else offered
+    if not candidates:
+        return Renderer("sketch", f"the built-in renderer, because MUJOCO_GL is {asked!r}")
+    for candidate in candidates:
+        if _draws(candidate):
+            os.environ["MUJOCO_GL"] = candidate
+            return Renderer(candidate, f"OpenGL through {candidate}")
+    return Renderer(
+        "sketch",
+        f"no OpenGL ({', '.join(candidates)} tried), so the slower built-in renderer draws; "
+        f"to change that: {PACKAGES}",
+    )
+
+
+def _draws(backend: str) -> bool:
+    environment = {**os.environ, "MUJOCO_GL": backend, "PYOPENGL_PLATFORM": backend}
+    if backend == "glfw":
+        environment.pop("PYOPENGL_PLATFORM")
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    except (OSError, subprocess.SubprocessError):
+        return False
+    return done.returncode == 0 and "drawn" in done.stdout
+
+
+@final
+class Episode:
+    """One episode of a team, drawn as it is played.
+
+    Iterate over `frames` to play it; afterwards `episode_return` and `steps` tell how it went.
+
+    Attributes:
+        fps: frames per second for playback in real time.
+        n_frames: the most frames it can have.
+    """
+
+    def __init__(
+        self, task: Task, policy: Policy, seed: int, seconds: float, renderer: Renderer
+    ) -> None:
+        """Makes the environment.
+
+        Args:
+            task: the task.
+            policy: maps a state [S] to a joint action [U] in [-1, 1].
+            seed: of the environment's reset.
+            seconds: stop after this much simulated time; 0 for the whole episode.
+            renderer: what draws MuJoCo.
+
+        Raises:
+            RenderError: if the environment is not MuJoCo's and cannot draw itself.
+        """
+        self._task, self._policy, self._seed = task, policy, seed
+        self._env, self._paint = _painter(task, renderer)
+        step_seconds = _step_seconds(self._env)
+        self._stride = math.ceil(1 / step_seconds / _MOST_FRAMES_PER_SECOND - 1e-6)
+        self.fps = 1 / step_seconds / self._stride
+        limit = task.spec.episode_limit
+        self._steps = min(limit, math.ceil(seconds / step_seconds)) if seconds > 0 else limit
+        self.n_frames = self._steps // self._stride + 1
+        self.episode_return = 0.0
+        self.steps = 0
+
+    def frames(self) -> Iterator[NDArray[np.uint8]]:
+        """Plays the episode; yields images [height, width, 3] and closes the environment."""
+        low = np.array(self._task.spec.action_low, np.float32)
+        high = np.array(self._task.spec.action_high, np.float32)
+        with contextlib.closing(self._env):
+            state, _ = self._env.reset(seed=self._seed)
+            yield self._paint(self._caption())
+            for step in range(self._steps):
+                action = self._policy(np.asarray(state, np.float32))
+                units = in_units(np.clip(action, -1, 1), low, high)
+                state, reward, terminated, truncated, _ = self._env.step(units)
+                self.episode_return += float(reward)
+                self.steps = step + 1
+                if self.steps % self._stride == 0:
+                    yield self._paint(self._caption())
+                if terminated or truncated:
+                    return
+
+    def _caption(self) -> str:
+        return f"step {self.steps}   return {self.episode_return:.0f}"
+
+
+def _painter(
+    task: Task, renderer: Renderer
+) -> tuple[gymnasium.Env[Any, Any], Callable[[str], NDArray[np.uint8]]]:
+    import mujoco
+
+    from race.viewing import sketch
+
+    env = task.make(None)
+    model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
+    if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        if renderer.backend != "sketch":
+            with contextlib.suppress(Exception):  # mujoco took up another backend, or none
+                scene = _opengl(model, data)
+                return env, lambda caption: sketch.with_caption(scene(), caption)
+        return env, lambda caption: sketch.draw(model, data, SIZE, caption)
+    env.close()
+    if "rgb_array" not in env.metadata.get("render_modes", ()):
+        raise RenderError(
+            f"The environment of {task.spec.task} cannot be drawn: it is not MuJoCo's and offers "
+            "no render_mode 'rgb_array'. Add that mode to the environment to make videos of it."
+        )
+    drawn = task.make("rgb_array")
+
+    def paint(caption: str) -> NDArray[np.uint8]:
+        frame = drawn.render()
+        if not isinstance(frame, np.ndarray) or frame.ndim != 3:
+            raise RenderError(f"The environment of {task.spec.task} drew no image.")
+        return sketch.with_caption(np.ascontiguousarray(frame[..., :3]), caption)
+
+    return drawn, paint
+
+
+def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
+    """Draws with OpenGL, through the same camera as the built-in renderer."""
+    import mujoco
+
+    from race.viewing import sketch
+
+    width, height = SIZE
+    opengl = mujoco.Renderer(model, height, width)
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    model.vis.global_.fovy = sketch.focus(model, data).field_of_view
+    # A plane collides everywhere but is drawn as large as its size says; 0 stands for endless.
+    model.geom_size[model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE), :2] = 0.0
+
+    def scene() -> NDArray[np.uint8]:
+        seen = sketch.focus(model, data)
+        camera.lookat[:] = seen.target
+        camera.distance = seen.distance
+        camera.azimuth = math.degrees(math.atan2(-seen.backward[1], -seen.backward[0]))
+        camera.elevation = -math.degrees(math.asin(seen.backward[2]))
+        opengl.update_scene(data, camera)
+        return np.asarray(opengl.render())
+
+    return scene
+
+
+def _step_seconds(env: gymnasium.Env[Any, Any]) -> float:
+    seconds = getattr(env.unwrapped, "dt", None)
+    if isinstance(seconds, float) and seconds > 0:
+        return seconds
+    return 1 / float(env.metadata.get("render_fps") or _MOST_FRAMES_PER_SECOND)
+
+
+def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:
+    """Writes an .mp4 (H.264, plays everywhere) or a looping .gif; returns the number of frames.
+
+    The file appears when it is complete.
+
+    Raises:
+        RenderError: for another ending, or if the file cannot be written.
+    """
+    ending = path.suffix.lower()
+    options: dict[str, Any]
+    if ending == ".mp4":
+        options = {
+            "fps": fps,
+            "codec": "libx264",
+            "pixelformat": "yuv420p",
+            "macro_block_size": 2,
+            "quality": 7,
+        }
+    elif ending == ".gif":
+        options = {"duration": 1000 / fps, "loop": 0}
+    else:
+        raise RenderError(f"{path} is no video: the name must end with .mp4 or .gif.")
+    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
+    count = 0
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with warnings.catch_warnings():
+            # The child becomes ffmpeg at once and touches nothing of JAX.
+            warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
+            with imageio.get_writer(temporary, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)
+                    count += 1
+        temporary.rename(path)
+    except OSError as error:
+        raise RenderError(f"{path} cannot be written: {error}.") from error
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+    return count

@@ -1,0 +1,354 @@
+"""The commands, with good and with bad input."""
+
+import dataclasses
+import json
+import os
+import re
+import shutil
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import fails, race
+
+from race.cli import COMMANDS
+from race.cli.progress import TrainingDisplay
+from race.config.settings import Config
+from race.runs import checkpoints, metrics
+from race.runs import directory as run_directory
+
+SMALL = (
+    "--env-steps 120 --learner.random-steps 40 --learner.hidden-sizes 12 8 --learner.batch-size 8 "
+    "--race.policy-embedding-size 4 --race.mine-size 6 --evaluation.every 60 "
+    "--evaluation.episodes 2"
+)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("runs") / "race"
+    race(f"train probe/terminates --run-dir {path} {SMALL}")
+    return path
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A finished run that a test may damage."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def test_overview_and_unknown_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    race("--help")
+    overview = capsys.readouterr().out
+    assert all(name in overview for name in COMMANDS)
+    race("--version")
+    assert re.fullmatch(r"race \d+\.\d+\.\d+\n", capsys.readouterr().out)
+    assert "Did you mean `race train`" in fails("trian", capsys)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        race(f"{command} --help")
+    assert stopped.value.code == 0
+    assert f"race {command}" in capsys.readouterr().out
+
+
+def test_a_run_directory_holds_what_it_should(trained: Path) -> None:
+    assert {"config.json", "metadata.json", "metrics.jsonl", "checkpoints", "DONE"} <= {
+        path.name for path in trained.iterdir()
+    }
+    config = json.loads((trained / "config.json").read_text())
+    assert (config["task"], config["algo"], config["env_steps"]) == (
+        "probe/terminates",
+        "race",
+        120,
+    )
+    metadata = json.loads((trained / "metadata.json").read_text())
+    assert "jax" in str(metadata)
+    for row in metrics.read(trained / "metrics.jsonl"):
+        assert {"kind", "env_steps", "gradient_steps", "generation", "wall_seconds"} <= set(row)
+
+
+def test_presets_are_defaults_and_flags_win(tmp_path: Path) -> None:
+    race(f"train probe/terminates --preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {SMALL}")
+    learner = json.loads((tmp_path / "a" / "config.json").read_text())["learner"]
+    assert learner["actor_learning_rate"] == 3e-4  # from the preset
+    assert learner["batch_size"] == 8  # from the flags
+    assert learner["policy_delay"] == 1  # MADDPG's
+
+
+def test_evaluate(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    results = {}
+    for team in ("marl", "champion", "selected"):
+        race(f"evaluate {trained} --team {team} --episodes 23 --seed 5 --json")
+        results[team] = json.loads(capsys.readouterr().out)
+        assert len(results[team]["returns"]) == 23
+        assert results[team]["return_mean"] == pytest.approx(5.0)
+    assert results["selected"]["played"] in ("marl", "champion")
+    race(f"evaluate {trained} --episodes 3")
+    assert "return over 3 episodes: 5" in capsys.readouterr().out
+
+
+def test_resume_extends_a_finished_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "has finished" in fails(f"resume {run}", capsys)
+    assert "would not extend" in fails(f"resume {run} --env-steps 100", capsys)
+    before = metrics.read(run / "metrics.jsonl")
+    race(f"resume {run} --env-steps 200")
+    after = metrics.read(run / "metrics.jsonl")
+    assert after[: len(before)] == before
+    assert after[-1]["env_steps"] >= 200
+    assert json.loads((run / "config.json").read_text())["env_steps"] == 200
+    assert (run / "DONE").exists()
+
+
+def test_a_failed_extension_changes_nothing(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    newest = checkpoints.newest(run / "checkpoints")
+    assert newest is not None
+    before = (run / "config.json").read_text()
+    (newest / "manifest.json").write_text("{}")
+    assert newest.name in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "config.json").read_text() == before
+    assert (run / "DONE").exists()
+    # The advice of the message works.
+    shutil.rmtree(newest)
+    race(f"resume {run} --env-steps 150")
+    assert json.loads((run / "config.json").read_text())["env_steps"] == 150
+    assert metrics.read(run / "metrics.jsonl")[-1]["env_steps"] >= 150
+
+
+def test_a_run_with_damaged_metrics_stays_as_it_is(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    truncate(run / "metrics.jsonl")
+    before = (run / "config.json").read_text()
+    assert "metrics.jsonl" in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "DONE").exists()
+    assert (run / "config.json").read_text() == before
+
+
+def test_a_budget_below_what_was_done_is_refused(
+    trained: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "DONE").unlink()  # as if killed just before it was written
+    assert "would not extend" in fails(f"resume {run} --env-steps 50", capsys)
+    race(f"resume {run}")
+    assert (run / "DONE").exists()
+    assert (run / "metrics.jsonl").read_bytes() == (trained / "metrics.jsonl").read_bytes()
+
+
+def test_a_locked_run_is_left_alone(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = (run / "config.json").read_text()
+    with run_directory.lock(run):
+        assert str(os.getpid()) in fails(f"resume {run} --env-steps 500", capsys)
+    assert (run / "config.json").read_text() == before
+
+
+def test_ctrl_c_saves_and_says_how_to_go_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = tmp_path / "whole"
+    race(f"train probe/terminates --run-dir {whole} {SMALL}")
+    path = tmp_path / "run"
+    calls = 0
+    real = TrainingDisplay.report
+
+    def interrupted(self: TrainingDisplay, *news: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == 9:
+            os.kill(os.getpid(), signal.SIGINT)
+        real(self, *news)
+
+    monkeypatch.setattr(TrainingDisplay, "report", interrupted)
+    with pytest.raises(SystemExit) as stopped:
+        race(f"train probe/terminates --run-dir {path} {SMALL}")
+    assert stopped.value.code == 130
+    assert f"race resume {path}" in " ".join(capsys.readouterr().out.split())
+    assert not (path / "DONE").exists()
+    race(f"resume {path}")
+
+    def rows(of: Path) -> list[dict[str, Any]]:
+        timeless = re.compile("wall_seconds|time/.*")
+        found = metrics.read(of / "metrics.jsonl")
+        return [{k: v for k, v in row.items() if not timeless.match(k)} for row in found]
+
+    assert rows(path) == rows(whole)
+
+
+def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        race("train --help")
+    text = capsys.readouterr().out
+    groups = {
+        f.name: f.default_factory()
+        for f in dataclasses.fields(Config)  # type: ignore[misc]
+        if f.default_factory is not dataclasses.MISSING
+    }
+    for group, settings in groups.items():
+        for setting in dataclasses.fields(settings):
+            assert f"--{group}.{setting.name}".replace("_", "-") in text
+
+
+def test_observations_are_settings(tmp_path: Path) -> None:
+    sees = "--env.agent-obsk 1 --env.local-categories qpos,qvel qpos --env.global-categories qvel"
+    race(f"train mamujoco/Hopper-3x1 {sees} --run-dir {tmp_path / 'run'} {SMALL}")
+    saved = json.loads((tmp_path / "run" / "config.json").read_text())["env"]
+    assert saved["local_categories"] == [["qpos", "qvel"], ["qpos"]]
+    assert saved["global_categories"] == ["qvel"]
+
+
+def test_list(capsys: pytest.CaptureFixture[str]) -> None:
+    race("list --json")
+    listing = json.loads(capsys.readouterr().out)
+    tasks = {task["id"]: task for task in listing["tasks"]}
+    assert (tasks["mamujoco/Ant-2x4d"]["alpha"], tasks["mamujoco/Ant-2x4d"]["beta"]) == (0.2, 1e-2)
+    assert sum(task["paper_name"] is not None for task in tasks.values()) == 16
+    battle = tasks["micro/MMM2"]
+    sizes = ("agents", "enemies", "actions", "obs", "state", "limit", "alpha", "beta")
+    assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, 0.01, 1e-2]
+    assert set(listing["algorithms"]) == {"race", "matd3", "maddpg", "facmac"}
+    race("list")
+    table = capsys.readouterr().out
+    assert "mamujoco/HumanoidStandup-9x8" in table
+    assert "micro/so_many_baneling" in table
+
+
+def test_render_a_battle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # The enemies are out of sight and hold, and the time limit is two steps.
+    Path("quiet.toml").write_text(
+        'description = "quiet"\nepisode_limit = 2\nenemy_order = { kind = "hold" }\n'
+        'allies = [{ unit = "Marine", count = 1, at = [4.0, 16.0] }]\n'
+        'enemies = [{ unit = "Marine", count = 1, at = [28.0, 16.0] }]\n'
+    )
+    race("render micro/quiet.toml --policy random")
+    line = capsys.readouterr().out
+    match = re.fullmatch(
+        r"battle\.gif: (\d+) frames, 2 steps of the random policy, return 0, time\n", line
+    )
+    assert match is not None, line
+    assert int(match[1]) > 17
+    race("render micro/quiet.toml --seconds 0.3 --out first.mp4")
+    line = capsys.readouterr().out
+    assert line == "first.mp4: 9 frames, 1 steps of the scripted policy, return 0, not finished\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"quiet.toml", "battle.gif", "first.mp4"}
+
+
+@pytest.mark.parametrize(
+    ("command", "hint"),
+    [
+        ("train mamujoco/HalfCheetah-2x4", "HalfCheetah-2x3"),
+        ("train mamujoco/HalfCheeta-2x3", "HalfCheetah-2x3"),
+        ("train HalfCheetah", "mamujoco/HalfCheetah"),
+        ("train no_such_module:make", "no_such_module"),
+        ("train probe/chain --race.population-size 1", "at least 4"),
+        ("train probe/chain --learner.batch-size 64 --learner.replay-capacity 32", "no larger"),
+        ("train probe/chain --env-steps -5", "from 1"),
+        ("train probe/chain --env-steps 10000", "more than the random steps"),
+        ("train probe/chain --learner.discount 1.5", "[0, 1)"),
+        ("train probe/chain --learner.gradient-clip nan", "finite"),
+        ("train probe/chain --race.vmm-weight nan", "finite"),
+        ("train probe/chain --checkpoint.minutes nan", "finite"),
+        ("train probe/chain --learner.actor-learning-rate inf", "finite"),
+        ("train probe/chain --seed -1", "from 0"),
+        ("train probe/chain --race.mine-size 100000000000", "at most"),
+        ("train probe/chain --learner.replay-capacity 100000000000", "at most"),
+        ("train probe/chain --algo sarsa", "sarsa"),
+        ("train probe/chain --learner.batch-size many", "many"),
+        ("train", "required"),
+        ("train probe/chain --no-such-flag 3", "no-such-flag"),
+        ("evaluate nowhere", "not the directory of a run"),
+        ("resume nowhere", "not the directory of a run"),
+        ("render nowhere", "not the directory of a run"),
+        ("render nowhere --out team.avi", ".mp4 or .gif"),
+        ("render nowhere --policy random", "--team"),
+        ("render micro/2s3y", "2s3z"),
+        ("render micro/nowhere.toml", "cannot be read"),
+        ("render micro/2s3z --out battle.avi", ".mp4 or .gif"),
+        ("render micro/2s3z --team marl", "--policy"),
+        ("render micro/2s3z --policy best", "scripted"),
+        ("render micro/2s3z --seconds nan", "0 or more"),
+        ("render micro/2s3z --seed 4294967296", "below"),
+        ("train micro/2s3z --algo matd3", "--algo facmac"),
+        ("train micro/2s3z --base maddpg", "--base facmac"),
+        ("train micro/2s3z --facmac.batch-size 64 --facmac.replay-capacity 32", "minibatch"),
+        ("train micro/2s3z --facmac.actor-learning-rate inf", "finite"),
+        ("train micro/2s3z --facmac.epsilon-start 1.5", "[0, 1]"),
+        ("train micro/2s3z --facmac.td-lambda nan", "td-lambda"),
+        ("train probe/chain --base facmac --facmac.mixer-size 0", "at least 1"),
+        ("train micro/2s3y", "2s3z"),
+        ("plot", "which runs"),
+        ("plot nowhere", "not a directory"),
+    ],
+)
+def test_bad_input_gets_a_message_and_leaves_nothing(
+    command: str,
+    hint: str,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert hint in fails(command, capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_input_to_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    message = fails(f"train probe/chain --run-dir {run} {SMALL}", capsys)
+    assert f"race resume {run}" in message
+    assert "at least 1" in fails(f"evaluate {run} --episodes 0", capsys)
+    assert "rgb_array" in fails(f"render {run} --out {run / 'team.mp4'}", capsys)
+    assert "Nearest" in fails(f"plot {run} --metric retrun --out {run / 'a.png'}", capsys)
+
+
+def test_a_champion_needs_a_population(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {SMALL}")
+    capsys.readouterr()
+    assert "no population" in fails(f"evaluate {tmp_path / 'run'} --team champion", capsys)
+
+
+def damage(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    path.write_bytes(bytes(content))
+
+
+def truncate(path: Path) -> None:
+    os.truncate(path, path.stat().st_size // 2)
+
+
+@pytest.mark.parametrize("how", [damage, truncate, Path.unlink])
+@pytest.mark.parametrize("file", ["arrays.safetensors", "manifest.json"])
+def test_a_damaged_checkpoint_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str], how: Any, file: str
+) -> None:
+    newest = checkpoints.newest(run / "checkpoints")
+    assert newest is not None
+    how(newest / file)
+    rows = (run / "metrics.jsonl").read_bytes()
+    for command in (f"resume {run} --env-steps 500", f"evaluate {run}", f"render {run}"):
+        assert newest.name in fails(command, capsys)
+    assert (run / "metrics.jsonl").read_bytes() == rows
+
+
+def test_a_checkpoint_of_another_run_is_refused(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    race(f"train probe/chain --run-dir {tmp_path / 'other'} {SMALL}")
+    shutil.rmtree(run / "checkpoints")
+    shutil.copytree(tmp_path / "other" / "checkpoints", run / "checkpoints")
+    capsys.readouterr()
+    assert "checkpoint" in fails(f"resume {run} --env-steps 500", capsys)
+    assert "checkpoint" in fails(f"evaluate {run}", capsys)
+
+
+def test_a_config_of_another_program_is_refused(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "config.json").write_text('{"some": "thing"}')
+    for command in ("resume", "evaluate", "render", "plot"):
+        assert "config" in fails(f"{command} {run}", capsys)
