@@ -11,7 +11,8 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses, Teams
-from race.config.settings import Config
+from race.config.hyper import Hyper
+from race.config.shape import Shape
 from race.learners import LEARNERS
 from race.networks.dense import act_teams
 from race.replay.buffer import Layout, Replay, distinct_places, insert, sample, slots_of
@@ -32,7 +33,7 @@ def empty_losses(algorithm: Algorithm) -> Losses:
 
 @partial(
     jax.jit,
-    static_argnames=("algorithm", "spec", "config"),
+    static_argnames=("algorithm", "spec", "shape"),
     donate_argnames=("state", "sums"),
 )
 def learn(
@@ -43,9 +44,10 @@ def learn(
     first_step: Int[Array, ""],
     n_steps: Int[Array, ""],
     *,
+    hyper: Hyper,
     algorithm: Algorithm,
     spec: Spec,
-    config: Config,
+    shape: Shape,
     layouts: Layout | None = None,
 ) -> tuple[Any, Losses]:
     """Gradient steps ``first_step`` to ``first_step + n_steps - 1`` of a run, in one program.
@@ -63,17 +65,17 @@ def learn(
         step = first_step + i
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, step))
         if layouts is None:
-            batch = sample(replay, config.learner.batch_size, sample_key)
+            batch = sample(replay, shape.batch_size, sample_key)
         else:
             batch = slots_of(replay, jax.tree.map(lambda column: column[i], layouts))
-        state, critic, policy = algorithm.update(state, batch, step, update_key, spec, config)
+        state, critic, policy = algorithm.update(state, batch, step, update_key, spec, shape, hyper)
         losses = critic | policy
         return state, {name: sums[name] + losses[name] for name in sums}
 
     return jax.lax.fori_loop(0, n_steps, body, (state, sums))
 
 
-@partial(jax.jit, static_argnames=("room", "config"))
+@partial(jax.jit, static_argnames=("room", "shape"))
 def draw(
     replay: Replay,
     key: PRNGKeyArray,
@@ -81,7 +83,7 @@ def draw(
     n_steps: Int[Array, ""],
     *,
     room: int,
-    config: Config,
+    shape: Shape,
 ) -> tuple[Int[Array, "room B"], Int[Array, "room B"]]:
     """The minibatches of episodes of some gradient steps: their places and their lengths.
 
@@ -92,26 +94,27 @@ def draw(
 
     def body(i: Int[Array, ""], places: Int[Array, "room B"]) -> Int[Array, "room B"]:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        return places.at[i].set(distinct_places(replay, config.facmac.batch_size, sample_key))
+        return places.at[i].set(distinct_places(replay, shape.batch_size, sample_key))
 
-    places = jnp.zeros((room, config.facmac.batch_size), jnp.int32)
+    places = jnp.zeros((room, shape.batch_size), jnp.int32)
     places = jax.lax.fori_loop(0, n_steps, body, places)
     return places, replay.data.length[places]
 
 
-@partial(jax.jit, static_argnames=("algorithm", "spec", "config"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
 def evolve(
     state: Any,
     fitness: Float[Array, "P"],
     key: PRNGKeyArray,
     *,
+    hyper: Hyper,
     algorithm: Algorithm,
     spec: Spec,
-    config: Config,
+    shape: Shape,
 ) -> Any:
     """One evolution of the population."""
     TRACES["evolve"] += 1
-    return algorithm.evolve(state, fitness, key, spec, config)
+    return algorithm.evolve(state, fitness, key, spec, shape, hyper)
 
 
 @partial(jax.jit, donate_argnames="replay")
@@ -135,11 +138,11 @@ def act(
     return act_teams(learner.encode(teams.encoder, state, spec), teams.heads, spec)
 
 
-@partial(jax.jit, static_argnames=("algorithm", "spec", "config"))
-def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: Spec, config: Config) -> Any:
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
+def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: Spec, shape: Shape) -> Any:
     """The state of an algorithm before its first step."""
     TRACES["start"] += 1
-    return algorithm.init(key, spec, config)
+    return algorithm.init(key, spec, shape)
 
 
 @jax.jit

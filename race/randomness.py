@@ -7,8 +7,6 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 from numpy.typing import NDArray
 
-from race.config.settings import Config
-
 
 class Purpose(IntEnum):
     """What randomness is for. Every use has its own stream, numbered by a counter of the run."""
@@ -21,12 +19,12 @@ class Purpose(IntEnum):
     EVALUATION = 5
 
 
-def root_key(config: Config, purpose: Purpose) -> PRNGKeyArray:
-    """The random key of one purpose."""
-    return jax.random.fold_in(jax.random.key(config.seed), int(purpose))
+def root_key(seed: int, purpose: Purpose) -> PRNGKeyArray:
+    """The random key of one purpose of a run."""
+    return jax.random.fold_in(jax.random.key(seed), int(purpose))
 
 
-def host_seeds(config: Config, purpose: Purpose, index: int, count: int) -> NDArray[np.int64]:
+def host_seeds(seed: int, purpose: Purpose, index: int, count: int) -> NDArray[np.int64]:
     """Seeds for environments, from the run's seed, the purpose and a counter."""
-    sequence = np.random.SeedSequence((config.seed, int(purpose), index))
+    sequence = np.random.SeedSequence((seed, int(purpose), index))
     return sequence.generate_state(count).astype(np.int64)

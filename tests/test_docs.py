@@ -23,6 +23,7 @@ SMALL = {
     "render": "--seconds 0.3",
     "bench": "--only env/Hopper*",
     "plot": "",
+    "archive": "",
     "list": "",
     "doctor": "",
 }
@@ -36,6 +37,8 @@ CONTINUOUS = (
 def small(words: list[str]) -> list[str]:
     """A command that is done soon."""
     options = shlex.split(SMALL[words[0]])
+    if "--seeds" in words:
+        options += ["--seeds", "1-2"]
     if words[0] == "train" and not isinstance(make_task(words[1]), DiscreteTask):
         options += shlex.split(CONTINUOUS)
     return [*words, *options]
@@ -64,8 +67,9 @@ def test_commands_in_documents_run(
         words = shlex.split(line)
         for word in words:
             # Figures of results show runs besides those whose commands are shown.
-            if word.startswith("results/") and (ROOT / word).is_dir() and "plot" in words:
-                shutil.copytree(ROOT / word, word, dirs_exist_ok=True)
+            if word.startswith("results/") and (ROOT / word).exists() and "plot" in words:
+                Path(word).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(ROOT / word, word)
         main(small(words[words.index("race") + 1 :]))
     for example in re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL):
         if "load_trained" in example:  # it reads a run of these commands

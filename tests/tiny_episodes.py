@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from race.algorithms import race
+from race.config.hyper import hyper_of
 from race.config.settings import Config, FacmacConfig
+from race.config.shape import shape_of
 from race.types import DiscreteSpec, Episode, Slots
 
 N, OBS, S, A, H, E, T = 3, 5, 6, 4, 5, 4, 5
@@ -67,7 +69,7 @@ def tiny_facmac(tiny_config: Callable[..., Config], layer_norm: bool = False) ->
 
 def start(config: Config) -> Any:
     """A fresh state of RACE, with targets and heads away from the online networks."""
-    state = jax.jit(partial(race.init, spec=SPEC, config=config))(jax.random.key(11))
+    state = jax.jit(partial(race.init, spec=SPEC, shape=shape_of(config)))(jax.random.key(11))
     leaves, structure = jax.tree.flatten(state.target)
     rng = np.random.default_rng(28)
     moved = [x + jnp.asarray(0.3 * rng.normal(size=x.shape), jnp.float32) for x in leaves]
@@ -198,7 +200,9 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
         samples = np.array([laid[0].sample_of[step] for step in sorted(laid[0].where)])[order]
         return jnp.asarray(np.concatenate([samples, np.setdiff1d(np.arange(count), samples)]))
 
-    update = jax.jit(partial(algorithm.update, spec=SPEC, config=config))
+    update = jax.jit(
+        partial(algorithm.update, spec=SPEC, shape=shape_of(config), hyper=hyper_of(config))
+    )
 
     def step(before: Any, batch: Laid, number: int = 1) -> Step:
         laid[:] = [batch]

@@ -20,19 +20,19 @@ class Teams(NamedTuple):
 
 
 class Algorithm(NamedTuple):
-    """Pure functions over one state pytree. ``spec`` and ``config`` are static."""
+    """Pure functions over one state pytree. ``spec`` and ``shape`` are static, ``hyper`` is not."""
 
     init: Callable[..., Any]
-    """(key, spec, config) -> state."""
+    """(key, spec, shape) -> state."""
     teams: Callable[..., Teams]
     """(state, spec) -> the teams that act."""
     champion: Callable[[Any], Float[Array, "N H1 A"]]
     """state -> heads of the team of best training fitness."""
     evolve: Callable[..., Any]
-    """(state, fitness [P], key, spec, config) -> state; lines 9 of Algorithm 1."""
+    """(state, fitness [P], key, spec, shape, hyper) -> state; lines 9 of Algorithm 1."""
     update: Callable[..., tuple[Any, Losses, Losses]]
-    """(state, batch, step, key, spec, config) -> state, critic losses, policy losses; lines 8,
-    10 and 13. Policy losses are zero on steps where the policy delay idles."""
+    """(state, batch, step, key, spec, shape, hyper) -> state, critic losses, policy losses; lines
+    8, 10 and 13. Policy losses are zero on steps where the policy delay idles."""
     inject: Callable[[Any], Any]
     """state -> state; line 11."""
     injection_counts: Callable[[Any], Array | np.ndarray]

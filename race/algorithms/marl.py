@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, when
-from race.config.settings import Config
+from race.config.hyper import Hyper
+from race.config.shape import Shape
 from race.learners import learner_of
 from race.method.equations import marl_policy_loss, td_loss
 from race.networks.optimization import Trainable, copy, descend, init_trainable
@@ -31,13 +32,13 @@ class MarlState(NamedTuple):
     target: Targets
 
 
-def init(key: PRNGKeyArray, spec: Spec, config: Config) -> MarlState:
+def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> MarlState:
     """A fresh learner whose targets equal its networks."""
-    learner = learner_of(config)
+    learner = learner_of(shape)
     encoder_key, head_key, critic_key = jax.random.split(key, 3)
-    encoder = learner.init_encoder(encoder_key, spec, config)
-    head = learner.init_head(head_key, spec, config)
-    critic = learner.init_critic(critic_key, spec, config)
+    encoder = learner.init_encoder(encoder_key, spec, shape)
+    head = learner.init_head(head_key, spec, shape)
+    critic = learner.init_critic(critic_key, spec, shape)
     return MarlState(
         init_trainable(encoder),
         init_trainable(head),
@@ -52,19 +53,20 @@ def update(
     step: Int[Array, ""],
     key: PRNGKeyArray,
     spec: Spec,
-    config: Config,
+    shape: Shape,
+    hyper: Hyper,
 ) -> tuple[MarlState, Losses, Losses]:
     """One gradient step: the critic always, the policy when its delay is over."""
-    learner, hyper = learner_of(config), config.hyper
+    learner = learner_of(shape)
     target = state.target
     target_key, policy_key = jax.random.split(key)
     now, taken, mask = learner.now(batch, spec)
     later = learner.later(batch, spec)
 
     z_next = learner.encode(target.encoder, later, spec)
-    next_action = learner.target_action(z_next, target.head, later, target_key, spec, config)
+    next_action = learner.target_action(z_next, target.head, later, target_key, spec, hyper)
     next_value = learner.pessimistic(learner.q_marl(target.critic, later, next_action, spec))
-    y = learner.td_target(batch, next_value, config)
+    y = learner.td_target(batch, next_value, hyper)
 
     def critic_loss(critic: Any) -> Float[Array, ""]:
         return td_loss(learner.q_marl(critic, now, taken, spec), y, mask)
@@ -88,13 +90,13 @@ def update(
         encoder = descend(state.encoder, encoder_gradient, rate, clip)
         head = descend(state.head, head_gradient, rate, clip)
         online = Targets(encoder.params, head.params, state.critic.params)
-        moved = learner.follow(state.target, online, step, config)
+        moved = learner.follow(state.target, online, step, shape, hyper)
         return MarlState(encoder, head, state.critic, moved), {"policy": loss}
 
     def idle(state: MarlState) -> tuple[MarlState, Losses]:
         return state, {"policy": jnp.zeros(())}
 
-    state, policy_losses = when(learner.policy_due(step, config), policy_step, idle, state)
+    state, policy_losses = when(learner.policy_due(step, shape), policy_step, idle, state)
     return state, {"critic": loss}, policy_losses
 
 
@@ -110,7 +112,12 @@ def _champion(state: MarlState) -> Float[Array, "_ H1 A"]:
 
 
 def _evolve(
-    state: MarlState, fitness: Float[Array, "P"], key: PRNGKeyArray, spec: Spec, config: Config
+    state: MarlState,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    spec: Spec,
+    shape: Shape,
+    hyper: Hyper,
 ) -> MarlState:
     return state
 

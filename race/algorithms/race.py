@@ -16,7 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, when
-from race.config.settings import Config
+from race.config.hyper import Hyper
+from race.config.shape import Shape
 from race.learners import learner_of
 from race.learners.base import Samples
 from race.method.equations import (
@@ -73,19 +74,19 @@ class RaceState(NamedTuple):
     injection_counts: Int[Array, "3"]  # elite, parent, discarded
 
 
-def init(key: PRNGKeyArray, spec: Spec, config: Config) -> RaceState:
+def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> RaceState:
     """Line 1."""
-    learner = learner_of(config)
+    learner = learner_of(shape)
     keys = jax.random.split(key, 7)
-    encoder = learner.init_encoder(keys[0], spec, config)
-    head = learner.init_head(keys[1], spec, config)
-    critic = learner.init_critic(keys[2], spec, config)
-    pevfa = learner.init_pevfa(keys[3], spec, config)
-    value = learner.init_value(keys[4], spec, config)
-    mine = learner.init_mine(keys[5], spec, config)
+    encoder = learner.init_encoder(keys[0], spec, shape)
+    head = learner.init_head(keys[1], spec, shape)
+    critic = learner.init_critic(keys[2], spec, shape)
+    pevfa = learner.init_pevfa(keys[3], spec, shape)
+    value = learner.init_value(keys[4], spec, shape)
+    mine = learner.init_mine(keys[5], spec, shape)
     heads = [
-        learner.init_heads(team_key, spec, config)
-        for team_key in jax.random.split(keys[6], config.race.population_size)
+        learner.init_heads(team_key, spec, shape)
+        for team_key in jax.random.split(keys[6], shape.population_size)
     ]
     return RaceState(
         policies=Policies(*map(init_trainable, (encoder, head, mine))),
@@ -115,23 +116,22 @@ def evolve(
     fitness: Float[Array, "P"],
     key: PRNGKeyArray,
     spec: Spec,
-    config: Config,
+    shape: Shape,
+    hyper: Hyper,
 ) -> RaceState:
     """Line 9: selection, agent-level crossover and mutation; and what became of the injected."""
-    race = config.race
-    assert race.mutation_fraction is not None
     select_key, breed_key, mutate_key = jax.random.split(key, 3)
-    chosen = select(fitness, race.tournament_size, select_key)
-    heads = breed(state.heads, chosen, breed_key, race.elite_copy)
+    chosen = select(fitness, shape.tournament_size, select_key)
+    heads = breed(state.heads, chosen, breed_key, shape.elite_copy)
     heads = mutate_population(
         heads,
         chosen.elite,
         jnp.asarray(spec.action_mask),
-        race.mutation_fraction,
-        race.mutation_probability,
-        race.agent_mutation_probability,
+        hyper.mutation_fraction,
+        hyper.mutation_probability,
+        hyper.agent_mutation_probability,
         mutate_key,
-        race.mutation_draw,
+        shape.mutation_draw,
     )
     is_elite = state.injected == chosen.elite
     is_parent = state.injected == chosen.parent
@@ -151,24 +151,25 @@ def update(
     step: Int[Array, ""],
     key: PRNGKeyArray,
     spec: Spec,
-    config: Config,
+    shape: Shape,
+    hyper: Hyper,
 ) -> tuple[RaceState, Losses, Losses]:
     """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
-    learner = learner_of(config)
+    learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
-    team = state.heads[jax.random.randint(team_key, (), 0, config.race.population_size)]
+    team = state.heads[jax.random.randint(team_key, (), 0, shape.population_size)]
     samples = learner.now(batch, spec)
     state, critic_losses, value = _train_critics(
-        state, batch, samples, team, critic_key, spec, config
+        state, batch, samples, team, critic_key, spec, shape, hyper
     )
 
     def policy_step(state: RaceState) -> tuple[RaceState, Losses]:
-        return _train_policies(state, samples, team, value, step, policy_key, spec, config)
+        return _train_policies(state, samples, team, value, step, policy_key, spec, shape, hyper)
 
     def idle(state: RaceState) -> tuple[RaceState, Losses]:
         return state, {name: jnp.zeros(()) for name in POLICY_LOSSES}
 
-    state, policy_losses = when(learner.policy_due(step, config), policy_step, idle, state)
+    state, policy_losses = when(learner.policy_due(step, shape), policy_step, idle, state)
     return state, critic_losses, policy_losses
 
 
@@ -179,10 +180,11 @@ def _train_critics(
     team: Float[Array, "N H1 A"],
     key: PRNGKeyArray,
     spec: Spec,
-    config: Config,
+    shape: Shape,
+    hyper: Hyper,
 ) -> tuple[RaceState, Losses, Float[Array, "B"]]:
     """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch."""
-    learner, hyper, target = learner_of(config), config.hyper, state.target
+    learner, target = learner_of(shape), state.target
     now, taken, mask = samples
     later = learner.later(batch, spec)
     marl_key, team_key = jax.random.split(key)
@@ -190,12 +192,12 @@ def _train_critics(
     # One pass of the target encoders serves both teams. Eq. (1) gives a prime to the MARL team's
     # policies alone; W_j has no slowly moving copy, but the encoder below it has.
     z = learner.encode(target.encoder, later, spec)
-    marl_action = learner.target_action(z, target.head, later, marl_key, spec, config)
-    team_action = learner.target_action(z, team, later, team_key, spec, config)
+    marl_action = learner.target_action(z, target.head, later, marl_key, spec, hyper)
+    team_action = learner.target_action(z, team, later, team_key, spec, hyper)
     marl_next = learner.q_marl(target.critic, later, marl_action, spec)
     team_next = learner.q_team(target.pevfa, later, team_action, team, spec)
     y_marl, y_team = (
-        learner.td_target(batch, learner.pessimistic(q), config) for q in (marl_next, team_next)
+        learner.td_target(batch, learner.pessimistic(q), hyper) for q in (marl_next, team_next)
     )
     best = best_target(y_marl, y_team)
 
@@ -228,11 +230,11 @@ def _train_policies(
     step: Int[Array, ""],
     key: PRNGKeyArray,
     spec: Spec,
-    config: Config,
+    shape: Shape,
+    hyper: Hyper,
 ) -> tuple[RaceState, Losses]:
     """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE."""
-    learner, hyper, beta = learner_of(config), config.hyper, config.race.vmm_weight
-    assert beta is not None
+    learner = learner_of(shape)
     now, _, mask = samples
     marl_key, team_key, pairs_key = jax.random.split(key, 3)
     critic = learner.first_critic(state.critics.critic.params)
@@ -256,7 +258,7 @@ def _train_policies(
         # Encoders and MINEs, of which there are equally many, share no parameter among themselves:
         # sums train each on its own terms.
         # W_marl enters through q_marl alone: its gradient is that of Eq. (7).
-        total = encoder_loss(vfm, jnp.sum(vmm), beta) - jnp.sum(bound)
+        total = encoder_loss(vfm, jnp.sum(vmm), hyper.vmm_weight) - jnp.sum(bound)
         losses = {
             "policy": marl_policy_loss(q_marl, mask),
             "vfm": vfm,
@@ -277,7 +279,7 @@ def _train_policies(
         state.critics.critic.params,
         state.critics.pevfa.params,
     )
-    target = learner.follow(state.target, online, step, config)
+    target = learner.follow(state.target, online, step, shape, hyper)
     return state._replace(policies=policies, target=target), losses
 
 

@@ -15,8 +15,10 @@ import numpy as np
 from race import programs
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best
+from race.config.hyper import hyper_of
 from race.config.presets import resolve
 from race.config.settings import Algo, Config
+from race.config.shape import shape_of
 from race.replay.buffer import Replay
 from race.replay.packing import layouts
 from race.rollouts.episodes import empty_episode
@@ -80,7 +82,8 @@ class EpisodeUpdates:
 
     def __init__(self, config: Config, spec: DiscreteSpec, episodes: Episode) -> None:
         algorithm = algorithm_of(config)
-        self._statics = {"algorithm": algorithm, "spec": spec, "config": config}
+        self._statics = {"algorithm": algorithm, "spec": spec, "shape": shape_of(config)}
+        self._hyper = hyper_of(config)
         places = np.tile(np.arange(config.facmac.batch_size), (STEPS, 1))
         self._layout = layouts(places, episodes.length[places], spec.episode_limit)
         data = Episode(*map(jnp.asarray, episodes))
@@ -98,6 +101,7 @@ class EpisodeUpdates:
             jax.random.key(1),
             np.int32(0),
             np.int32(steps),
+            hyper=self._hyper,
             **self._statics,
             layouts=self._layout,
         )

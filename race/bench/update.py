@@ -12,8 +12,10 @@ from race import programs
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best, seconds
 from race.bench.products import operations, products_alone, products_in
+from race.config.hyper import Hyper, hyper_of
 from race.config.presets import resolve
 from race.config.settings import Algo, Config, LearnerConfig
+from race.config.shape import shape_of
 from race.envs import make_continuous_task
 from race.replay.buffer import Replay, sample
 from race.types import EnvSpec, Transition
@@ -53,7 +55,8 @@ class Updates:
         self.spec = make_continuous_task(config.task, config.env).spec
         self.algorithm = algorithm_of(config)
         self.replay = random_replay(self.spec, transitions)
-        self._statics = {"algorithm": self.algorithm, "spec": self.spec, "config": config}
+        self._statics = {"algorithm": self.algorithm, "spec": self.spec, "shape": shape_of(config)}
+        self._hyper = hyper_of(config)
         self.state = programs.start(jax.random.key(0), **self._statics)
         self._sums = programs.empty_losses(self.algorithm)
 
@@ -66,18 +69,23 @@ class Updates:
             jax.random.key(1),
             np.int32(0),
             np.int32(steps),
+            hyper=self._hyper,
             **self._statics,
         )
         return self.state
 
     def hlo(self, step: int) -> str:
         """The compiled text of the gradient step of one number, all its conditions resolved."""
+        shape = shape_of(self.config)
 
-        def update(state: Any, batch: Transition, key: jax.Array) -> Any:
-            return self.algorithm.update(state, batch, jnp.int32(step), key, self.spec, self.config)
+        def update(state: Any, batch: Transition, key: jax.Array, hyper: Hyper) -> Any:
+            number = jnp.int32(step)
+            return self.algorithm.update(state, batch, number, key, self.spec, shape, hyper)
 
         batch = sample(self.replay, self.config.learner.batch_size, jax.random.key(2))
-        compiled = jax.jit(update).lower(self.state, batch, jax.random.key(3)).compile()
+        compiled = (
+            jax.jit(update).lower(self.state, batch, jax.random.key(3), self._hyper).compile()
+        )
         text = compiled.as_text()
         assert text is not None, "this backend does not show its programs"
         return text

@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",
     "plot": "draw learning curves of one or more runs",
+    "archive": "put the results of many runs into one small file",
     "list": "show tasks, algorithms and presets",
     "bench": "measure speed and memory on this machine",
     "doctor": "show what is installed, what is missing and how to mend it",

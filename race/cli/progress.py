@@ -57,7 +57,7 @@ class TrainingDisplay:
             self._task, completed=covered, stage=stage, details=self._details(progress, covered)
         )
         if "eval/selected/return_mean" in row:
-            self._test = _test_summary(row)
+            self._test = test_summary(row)
             self._console.print(self._line(row), highlight=False, soft_wrap=True)
 
     def _details(self, progress: Progress, covered: float) -> str:
@@ -69,7 +69,7 @@ class TrainingDisplay:
             self._rate = (covered - self._origin[1]) / (now - self._origin[0])
         if self._rate > 0:
             left = max(self._config.env_steps - covered, 0) / self._rate
-            parts += [f"{self._rate:.0f} steps/s", f"{_duration(left)} left"]
+            parts += [f"{self._rate:.0f} steps/s", f"{duration(left)} left"]
         if progress.fitness:
             parts.append(f"population best {rounded(max(progress.fitness))}")
         if progress.generation:
@@ -79,7 +79,7 @@ class TrainingDisplay:
     def _line(self, row: dict[str, Any]) -> str:
         return (
             f"{row['env_steps']:>9,} steps, generation {row['generation']:>4}, "
-            f"{_duration(row['wall_seconds']):>7}: test return {_test_summary(row)}"
+            f"{duration(row['wall_seconds']):>7}: test return {test_summary(row)}"
         )
 
 
@@ -96,7 +96,8 @@ def _covered(progress: Progress, config: Config) -> float:
     return progress.env_steps_before + made * min(learned / max(due, 1.0), 1.0)
 
 
-def _test_summary(row: dict[str, Any]) -> str:
+def test_summary(row: dict[str, Any]) -> str:
+    """The test results in a row of metrics."""
     names = [name for name in ("marl", "champion") if f"eval/{name}/return_mean" in row]
     labels = {"marl": "MARL team", "champion": "champion"}
     return ", ".join(
@@ -107,7 +108,8 @@ def _test_summary(row: dict[str, Any]) -> str:
     )
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time for people to read."""
     minutes, s = divmod(round(seconds), 60)
     hours, m = divmod(minutes, 60)
     return f"{hours}h{m:02}m" if hours else f"{m}m{s:02}s"

@@ -12,24 +12,34 @@ from race.config.presets import resolve
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run exactly where it was.
+    """Go on with a run exactly where it was, or with all of several seeds that are unfinished.
 
     The newest checkpoint is loaded, rows of metrics written after it are dropped and written
     again, number for number (times excepted) as if the run had never stopped.
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The run's directory."""
+    """The run's directory, or that of several seeds."""
     env_steps: int | None = None
     """Train up to this many environment steps instead of what the run began with."""
+    jobs: int | None = None
+    """If DIR holds the runs of several seeds: so many at a time. None: as many as cores."""
 
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments and trains."""
     chosen = tyro.cli(Resume, args=arguments, prog="race resume")
+    from race.cli.seeds import directories_of, run_all
     from race.cli.training import run
+    from race.errors import ConfigError
     from race.runs import directory as run_directory
+    from race.runs.directory import RunDirectory
 
+    if not RunDirectory(chosen.run_dir).config.exists() and directories_of(chosen.run_dir):
+        run_all(chosen.run_dir, chosen.jobs, chosen.env_steps)
+        return
+    if chosen.jobs is not None:
+        raise ConfigError(f"--jobs has no effect on {chosen.run_dir}, which is one run.")
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))

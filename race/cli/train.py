@@ -21,7 +21,7 @@ from race.config.settings import (
     Preset,
     RaceConfig,
 )
-from race.errors import ConfigError
+from race.errors import ConfigError, RunDirectoryError
 from race.types import DiscreteTask
 
 
@@ -43,10 +43,15 @@ class Train:
     """The gradient learner inside race. None: matd3, on tasks with discrete actions facmac."""
     seed: int = 1
     """Seed of everything random: the same seed gives the same run."""
+    seeds: str | None = None
+    """Several seeds instead, such as 1-5 or 1,4,7: a run each, in RUN_DIR/seedN, at once as far as
+    there are cores. `race resume RUN_DIR` goes on with all of them."""
+    jobs: int | None = None
+    """With --seeds: runs at a time, each on a core of its own. None: as many as cores."""
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
     run_dir: Path | None = None
-    """Where the run is kept. Default: runs/TASK-ALGO-seedN."""
+    """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO."""
     preset: Preset = "paper"
     """Learner settings to start from: the paper's, those of the official TD3 code, or small
     networks for a quick look. On tasks with discrete actions there is only the paper's."""
@@ -69,6 +74,7 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
+    from race.cli.seeds import run_all
     from race.cli.training import describe, run
     from race.envs import make_task
     from race.runs import directory as run_directory
@@ -77,9 +83,38 @@ def main(arguments: list[str]) -> None:
     discrete = isinstance(task, DiscreteTask)
     _refuse_without_effect(asked, chosen.preset, discrete)
     config = resolve(asked, discrete=discrete)
+    if chosen.seeds is None:
+        if chosen.jobs is not None:
+            raise ConfigError("--jobs has no effect without --seeds. Leave it out.")
+        path = chosen.run_dir or Path("runs") / f"{_name(config)}-seed{config.seed}"
+        run_directory.create(path, config, describe(task))
+        run(path, config)
+        return
     path = chosen.run_dir or Path("runs") / _name(config)
-    run_directory.create(path, config, describe(task))
-    run(path, config)
+    _create_all(path, config, chosen, describe(task))
+    run_all(path, chosen.jobs)
+
+
+def _create_all(path: Path, config: Config, chosen: Train, described: dict[str, Any]) -> None:
+    """Makes the run directories of several seeds, or none."""
+    from race.cli.seeds import parse_seeds
+    from race.runs import directory as run_directory
+
+    seeds = parse_seeds(str(chosen.seeds))
+    if chosen.seed != 1:
+        raise ConfigError("--seed and --seeds are two ways to say it; leave one out.")
+    if chosen.jobs is not None and chosen.jobs < 1:
+        raise ConfigError(f"--jobs is {chosen.jobs}, but it must be at least 1.")
+    configs = [resolve(dataclasses.replace(config, seed=seed)) for seed in seeds]
+    places = [path / f"seed{seed}" for seed in seeds]
+    for place in (path, *places):
+        if (place / "config.json").exists():
+            raise RunDirectoryError(
+                f"{place} already holds a run. Go on with all runs of {path} by `race resume "
+                f"{path}`, or choose another directory with `--run-dir`."
+            )
+    for place, one in zip(places, configs, strict=True):
+        run_directory.create(place, one, described)
 
 
 def _parse(arguments: list[str]) -> Train:
@@ -123,7 +158,7 @@ def _changed(group: str, asked: Any, default: Any, used: Set[str] = frozenset())
 
 def _name(config: Config) -> str:
     task = config.task.replace("/", "-").replace(":", "-")
-    return f"{task}-{config.method.replace('(', '-').replace(')', '').lower()}-seed{config.seed}"
+    return f"{task}-{config.method.replace('(', '-').replace(')', '').lower()}"
 
 
 __all__ = ["Train", "main"]

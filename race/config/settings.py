@@ -222,11 +222,6 @@ class Config:
         return f"RACE({str(self.base).upper()})" if self.algo == "race" else self.algo.upper()
 
     @property
-    def hyper(self) -> LearnerConfig | FacmacConfig:
-        """The settings of the learner on this kind of task."""
-        return self.facmac if self.discrete else self.learner
-
-    @property
     def policy_delay(self) -> int:
         """Critic steps per policy step."""
         return 1 if self.discrete else self.learner.policy_delay
@@ -237,12 +232,18 @@ def to_json(config: Any) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
-# What runs of older versions do not have in their files: settings of tasks they could not train on.
-_LATER = frozenset({"facmac", "discrete"})
+# Settings that runs of older versions do not have in their files, and what these runs did.
+_BEFORE: dict[str, Any] = {
+    "facmac": FacmacConfig(layer_norm=False),
+    "discrete": False,
+    "layer_norm": False,
+    "mutation_draw": "weight",
+    "elite_copy": False,
+}
 
 
 def from_json(data: dict[str, Any]) -> Config:
-    """Reads back what `to_json` wrote, also that of a version without discrete actions.
+    """Reads back what `to_json` wrote, also that of an older version.
 
     Raises:
         ConfigError: if a field is missing, unknown or of the wrong kind.
@@ -253,13 +254,13 @@ def from_json(data: dict[str, Any]) -> Config:
 def _build(cls: Any, data: Any) -> Any:
     hints = get_type_hints(cls)
     names = {f.name for f in dataclasses.fields(cls)}
-    if not isinstance(data, dict) or set(data) | (_LATER & names) != names:
+    if not isinstance(data, dict) or set(data) | (set(_BEFORE) & names) != names:
         found = sorted(data) if isinstance(data, dict) else data
         raise ConfigError(
             f"The saved configuration does not fit this version of race: {cls.__name__} has the "
             f"fields {sorted(names)}, the file has {found}."
         )
-    values = {}
+    values = {name: value for name, value in _BEFORE.items() if name in names}
     for name, value in data.items():
         if dataclasses.is_dataclass(hints[name]):
             values[name] = _build(hints[name], value)

@@ -3,7 +3,7 @@
 A method is added as one more `Learner`; algorithms are written against that interface alone.
 """
 
-from race.config.settings import Config
+from race.config.shape import Shape
 from race.learners.base import Learner
 from race.learners.facmac import facmac
 from race.learners.facmac_continuous import facmac_continuous
@@ -14,10 +14,9 @@ LEARNERS: dict[str, Learner] = {"matd3": matd3, "maddpg": maddpg, "facmac": facm
 """Those of continuous actions by name; on discrete ones there is `facmac`."""
 
 
-def learner_of(config: Config) -> Learner:
-    """The learner of a resolved configuration."""
-    assert config.base is not None
-    return facmac if config.discrete else LEARNERS[config.base]
+def learner_of(shape: Shape) -> Learner:
+    """The learner of a run."""
+    return facmac if shape.discrete else LEARNERS[shape.base]
 
 
 __all__ = ["LEARNERS", "Learner", "facmac", "facmac_continuous", "learner_of", "maddpg", "matd3"]

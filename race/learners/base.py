@@ -22,26 +22,27 @@ class Samples(NamedTuple):
 class Learner(NamedTuple):
     """A base MARL method: pure functions over its networks.
 
-    ``spec`` is the task's spec and ``config`` the whole `Config`; parameters of networks are
-    pytrees that only the learner looks into. ``B`` samples of a minibatch are transitions or the
-    steps of whole episodes; ``B'`` moments are those at which targets are evaluated.
+    ``spec`` is the task's spec, ``shape`` the run's `Shape`, ``hyper`` its `Hyper`; parameters of
+    networks are pytrees that only the learner looks into. ``B`` samples of a minibatch are
+    transitions or the steps of whole episodes; ``B'`` moments are those at which targets are
+    evaluated.
     """
 
     init_encoder: Callable[..., Any]
-    """(key, spec, config) -> the encoders of all agents."""
+    """(key, spec, shape) -> the encoders of all agents."""
     init_head: Callable[..., Float[Array, "_ H1 A"]]
-    """(key, spec, config) -> the MARL team's policy representations: one per agent, or one that
+    """(key, spec, shape) -> the MARL team's policy representations: one per agent, or one that
     all agents share."""
     init_heads: Callable[..., Float[Array, "N H1 A"]]
-    """(key, spec, config) -> those of a team of the population, one per agent."""
+    """(key, spec, shape) -> those of a team of the population, one per agent."""
     init_critic: Callable[..., Any]
-    """(key, spec, config) -> the MARL critic Q_psi."""
+    """(key, spec, shape) -> the MARL critic Q_psi."""
     init_pevfa: Callable[..., Any]
-    """(key, spec, config) -> the PeVFA Q_theta."""
+    """(key, spec, shape) -> the PeVFA Q_theta."""
     init_value: Callable[..., Any]
-    """(key, spec, config) -> the state-value net V_zeta."""
+    """(key, spec, shape) -> the state-value net V_zeta."""
     init_mine: Callable[..., Any]
-    """(key, spec, config) -> MINE networks T_omega, one per encoder."""
+    """(key, spec, shape) -> MINE networks T_omega, one per encoder."""
     now: Callable[..., Samples]
     """(batch, spec) -> the steps of a minibatch."""
     later: Callable[..., Any]
@@ -52,7 +53,7 @@ class Learner(NamedTuple):
     """(z, head, moments, key, spec) -> the team's joint actions, through which policies are
     trained."""
     target_action: Callable[..., Array]
-    """(z, head, moments, key, spec, config) -> the joint actions at which a target is evaluated."""
+    """(z, head, moments, key, spec, hyper) -> the joint actions at which a target is evaluated."""
     q_marl: Callable[..., Values]
     """(critic, moments, action, spec) -> Q_psi(s, u) of each critic."""
     q_team: Callable[..., Values]
@@ -60,7 +61,7 @@ class Learner(NamedTuple):
     pessimistic: Callable[[Values], Float[Array, "B"]]
     """The value that targets use, of the ensemble's."""
     td_target: Callable[..., Float[Array, "B"]]
-    """(batch, values [B'], config) -> the targets y of Eq. (1)."""
+    """(batch, values [B'], hyper) -> the targets y of Eq. (1)."""
     first_critic: Callable[[Any], Any]
     """The part of a critic (of Q_psi) that policies maximise."""
     first_pevfa: Callable[[Any], Any]
@@ -70,6 +71,6 @@ class Learner(NamedTuple):
     mutual_information: Callable[..., Float[Array, "M B"]]
     """(mine, moments, z, key) -> the signals I_t below Eq. (3) of each MINE."""
     policy_due: Callable[..., bool | Bool[Array, ""]]
-    """(step, config) -> whether this gradient step also trains policies and moves targets."""
+    """(step, shape) -> whether this gradient step also trains policies and moves targets."""
     follow: Callable[..., Any]
-    """(target, online, step, config) -> the targets after this gradient step."""
+    """(target, online, step, shape, hyper) -> the targets after this gradient step."""

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race.config.settings import Config
+from race.config.hyper import Hyper
+from race.config.shape import Shape
 from race.learners.base import Learner, Samples
 from race.method.equations import mutual_information_signal
 from race.method.exploration import greedy, gumbel_softmax
@@ -44,68 +45,65 @@ class Moments(NamedTuple):
     real: Float[Array, "L R"]  # 0 where no step was made, or in `later` where there is no moment
 
 
-def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> GruEncoder:
+def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> GruEncoder:
     """A fresh encoder, one for all agents."""
-    facmac = config.facmac
-    return init_gru_encoder(
-        key, spec.obs_size, spec.n_actions, spec.n_agents, facmac.hidden_size, facmac.layer_norm
-    )
+    size, layer_norm = shape.embedding_size, shape.layer_norm
+    return init_gru_encoder(key, spec.obs_size, spec.n_actions, spec.n_agents, size, layer_norm)
 
 
-def new_head(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Float[Array, "1 H1 A"]:
+def new_head(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> Float[Array, "1 H1 A"]:
     """A fresh head for all agents: the MARL team has but one (Appendix A.1)."""
-    return init_one_head(key, config.facmac.hidden_size, spec.n_actions)[None]
+    return init_one_head(key, shape.embedding_size, spec.n_actions)[None]
 
 
-def new_heads(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Float[Array, "N H1 A"]:
+def new_heads(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> Float[Array, "N H1 A"]:
     """Fresh heads of a team of the population, one per agent."""
     keys = jax.random.split(key, spec.n_agents)
-    heads = [init_one_head(k, config.facmac.hidden_size, spec.n_actions) for k in keys]
+    heads = [init_one_head(k, shape.embedding_size, spec.n_actions) for k in keys]
     return jnp.stack(heads)
 
 
 def new_critic(
-    key: PRNGKeyArray, spec: DiscreteSpec, config: Config, further_inputs: int = 0
+    key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape, further_inputs: int = 0
 ) -> FactoredCritic:
     """Fresh utilities, one network for all agents, and a fresh mixer."""
     utility_key, mixer_key = jax.random.split(key)
-    facmac = config.facmac
     return FactoredCritic(
         factored.init_utilities(
             utility_key,
             spec.obs_size,
             spec.n_actions,
-            facmac.utility_sizes,
-            facmac.layer_norm,
+            shape.critic_sizes,
+            shape.layer_norm,
             further_inputs,
         ),
         factored.init_mixer(
             mixer_key,
             spec.state_size,
             spec.n_agents,
-            facmac.mixer_size,
-            facmac.hypernet_size,
+            shape.mixer_size,
+            shape.hypernet_size,
             further_inputs,
         ),
     )
 
 
-def new_pevfa(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> FactoredPevfa:
+def new_pevfa(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> FactoredPevfa:
     """A fresh Critic PeVFA and Mixer PeVFA."""
     critic_key, pevfa_key = jax.random.split(key)
-    size = config.race.policy_embedding_size
-    critic = new_critic(critic_key, spec, config, size)
-    return factored.init_pevfa(pevfa_key, critic, config.facmac.hidden_size + 1, size)
+    size = shape.policy_embedding_size
+    critic = new_critic(critic_key, spec, shape, size)
+    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size)
 
 
-def new_value(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> StateValue:
+def new_value(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> StateValue:
     """A fresh state-value net."""
-    return critics.init_state_value(key, spec.state_size, (config.facmac.value_size,))
+    return critics.init_state_value(key, spec.state_size, shape.value_sizes)
 
 
-def new_mine(key: PRNGKeyArray, spec: DiscreteSpec, config: Config) -> Mine:
+def new_mine(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> Mine:
     """A fresh MINE network: one, because there is one encoder (Appendix A.1)."""
-    return init_one_mine(key, spec.state_size, config.facmac.hidden_size, config.race.mine_size)
+    return init_one_mine(key, spec.state_size, shape.embedding_size, shape.mine_size)
 
 
 def now(batch: Slots, spec: DiscreteSpec) -> Samples:
@@ -165,7 +163,7 @@ def target_action(
     moments: Moments,
     key: PRNGKeyArray,
     spec: DiscreteSpec,
-    config: Config,
+    hyper: Hyper,
 ) -> Float[Array, "B N A"]:
     """The policies' best actions."""
     action = greedy(logits(z, head), moments.avail_actions)
@@ -210,17 +208,16 @@ def only(values: Float[Array, "1 B"]) -> Float[Array, "B"]:
     return values[0]
 
 
-def td_target(batch: Slots, value: Float[Array, "moments"], config: Config) -> Float[Array, "B"]:
+def td_target(batch: Slots, value: Float[Array, "moments"], hyper: Hyper) -> Float[Array, "B"]:
     """TD(lambda) targets of every step; ``value`` holds those of all slots."""
-    facmac = config.facmac
     by_slot = value.reshape(batch.reward.shape)
     return lambda_returns(
         batch.reward[:-1],
         batch.terminated[:-1],
         by_slot[1:],
         batch.acted[:-1],
-        facmac.discount,
-        facmac.td_lambda,
+        hyper.discount,
+        hyper.td_lambda,
     ).reshape(-1)
 
 
@@ -269,14 +266,14 @@ def mutual_information(
     return mean.reshape(-1)[jnp.argsort(deal)[:samples]][None]
 
 
-def policy_due(step: Int[Array, ""], config: Config) -> bool:
+def policy_due(step: Int[Array, ""], shape: Shape) -> bool:
     """Policies are trained at every step."""
     return True
 
 
-def follow(target: Any, online: Any, step: Int[Array, ""], config: Config) -> Any:
+def follow(target: Any, online: Any, step: Int[Array, ""], shape: Shape, hyper: Hyper) -> Any:
     """Targets become copies of the networks after every so many gradient steps."""
-    due = (step + 1) % config.facmac.target_update_every == 0
+    due = (step + 1) % shape.target_update_every == 0
     return jax.tree.map(lambda t, o: jnp.where(due, o, t), target, online)
 
 

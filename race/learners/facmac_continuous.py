@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from race.config.settings import Config
-from race.learners.matd3 import matd3
+from race.config.shape import Shape
+from race.learners.maddpg import maddpg
 from race.networks import factored
 from race.networks.dense import head_vectors, stack
 from race.networks.factored import FactoredCritic, FactoredPevfa
@@ -19,7 +19,7 @@ from race.types import EnvSpec
 
 
 def new_critic(
-    key: PRNGKeyArray, spec: EnvSpec, config: Config, further_inputs: int = 0
+    key: PRNGKeyArray, spec: EnvSpec, shape: Shape, further_inputs: int = 0
 ) -> FactoredCritic:
     """Fresh utilities, one network per agent, and a fresh mixer."""
     mixer_key, *keys = jax.random.split(key, 1 + spec.n_agents)
@@ -29,26 +29,26 @@ def new_critic(
             agent_key,
             obs_size,
             action_size,
-            config.learner.hidden_sizes,
-            config.learner.layer_norm,
+            shape.critic_sizes,
+            shape.layer_norm,
             further_inputs,
             padding=obs_size + action_size - obs - action,
         )
         for agent_key, obs, action in zip(keys, spec.obs_sizes, spec.action_sizes, strict=True)
     ]
-    size, hypernet = config.facmac.mixer_size, config.facmac.hypernet_size
+    size, hypernet = shape.mixer_size, shape.hypernet_size
     mixer = factored.init_mixer(
         mixer_key, spec.state_size, spec.n_agents, size, hypernet, further_inputs
     )
     return FactoredCritic(stack(utilities), mixer)
 
 
-def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> FactoredPevfa:
+def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> FactoredPevfa:
     """A fresh Critic PeVFA and Mixer PeVFA."""
     critic_key, pevfa_key = jax.random.split(key)
-    size = config.race.policy_embedding_size
-    critic = new_critic(critic_key, spec, config, size)
-    return factored.init_pevfa(pevfa_key, critic, config.learner.hidden_sizes[1] + 1, size)
+    size = shape.policy_embedding_size
+    critic = new_critic(critic_key, spec, shape, size)
+    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size)
 
 
 def _values(
@@ -104,7 +104,7 @@ def same_pevfa(pevfa: FactoredPevfa) -> FactoredPevfa:
     return pevfa
 
 
-facmac_continuous = matd3._replace(
+facmac_continuous = maddpg._replace(
     init_critic=new_critic,
     init_pevfa=new_pevfa,
     q_marl=q_marl,

@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race.config.settings import Config
+from race.config.hyper import Hyper
+from race.config.shape import Shape
 from race.learners.base import Learner, Samples
 from race.method.equations import mutual_information_signal, td_target
 from race.networks import critics
@@ -25,46 +26,45 @@ from race.types import EnvSpec, Transition
 N_CRITICS = 2
 
 
-def new_encoder(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Encoder:
+def new_encoder(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Encoder:
     """Fresh encoders of all agents."""
-    return networks.init_encoder(key, spec, config.learner.hidden_sizes, config.learner.layer_norm)
+    return networks.init_encoder(key, spec, shape.hidden_sizes, shape.layer_norm)
 
 
-def new_head(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Float[Array, "N H1 A"]:
+def new_head(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Float[Array, "N H1 A"]:
     """A fresh team."""
-    return networks.init_head(key, spec, config.learner.hidden_sizes[1])
+    return networks.init_head(key, spec, shape.embedding_size)
 
 
-def critics_of(key: PRNGKeyArray, spec: EnvSpec, config: Config, count: int) -> Critic:
+def critics_of(key: PRNGKeyArray, spec: EnvSpec, shape: Shape, count: int) -> Critic:
     """A fresh ensemble."""
-    learner = config.learner
-    return critics.init_critic(key, spec, learner.hidden_sizes, count, learner.layer_norm)
+    return critics.init_critic(key, spec, shape.critic_sizes, count, shape.layer_norm)
 
 
-def pevfas_of(key: PRNGKeyArray, spec: EnvSpec, config: Config, count: int) -> Pevfa:
+def pevfas_of(key: PRNGKeyArray, spec: EnvSpec, shape: Shape, count: int) -> Pevfa:
     """A fresh ensemble of PeVFAs over one policy embedding."""
-    learner, size = config.learner, config.race.policy_embedding_size
-    return critics.init_pevfa(key, spec, learner.hidden_sizes, count, learner.layer_norm, size)
+    sizes, size = shape.critic_sizes, shape.policy_embedding_size
+    return critics.init_pevfa(key, spec, sizes, count, shape.layer_norm, size)
 
 
-def new_critic(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Critic:
+def new_critic(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Critic:
     """A fresh twin critic."""
-    return critics_of(key, spec, config, N_CRITICS)
+    return critics_of(key, spec, shape, N_CRITICS)
 
 
-def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Pevfa:
+def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Pevfa:
     """A fresh twin PeVFA."""
-    return pevfas_of(key, spec, config, N_CRITICS)
+    return pevfas_of(key, spec, shape, N_CRITICS)
 
 
-def new_value(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> StateValue:
+def new_value(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> StateValue:
     """A fresh state-value net."""
-    return critics.init_state_value(key, spec.state_size, config.learner.hidden_sizes)
+    return critics.init_state_value(key, spec.state_size, shape.value_sizes)
 
 
-def new_mine(key: PRNGKeyArray, spec: EnvSpec, config: Config) -> Mine:
+def new_mine(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Mine:
     """One fresh MINE network per agent."""
-    return networks.init_mine(key, spec, config.learner.hidden_sizes[1], config.race.mine_size)
+    return networks.init_mine(key, spec, shape.embedding_size, shape.mine_size)
 
 
 def now(batch: Transition, spec: EnvSpec) -> Samples:
@@ -94,11 +94,8 @@ def act(
     return networks.act(z, head, spec)
 
 
-def smooth(action: Float[Array, "B U"], key: PRNGKeyArray, config: Config) -> Float[Array, "B U"]:
+def smooth(action: Float[Array, "B U"], key: PRNGKeyArray, hyper: Hyper) -> Float[Array, "B U"]:
     """Target policy smoothing: clipped Gaussian noise, then the action's own bounds."""
-    hyper = config.learner
-    if hyper.smoothing_noise == 0:
-        return action
     noise = hyper.smoothing_noise * jax.random.normal(key, action.shape, action.dtype)
     noise = jnp.clip(noise, -hyper.smoothing_clip, hyper.smoothing_clip)
     return jnp.clip(action + noise, -1.0, 1.0)
@@ -110,10 +107,10 @@ def target_action(
     state: Float[Array, "B S"],
     key: PRNGKeyArray,
     spec: EnvSpec,
-    config: Config,
+    hyper: Hyper,
 ) -> Float[Array, "B U"]:
     """The policies' actions, smoothed."""
-    return smooth(networks.act(z, head, spec), key, config)
+    return smooth(networks.act(z, head, spec), key, hyper)
 
 
 def q_marl(
@@ -140,10 +137,10 @@ def smaller(values: Float[Array, "K B"]) -> Float[Array, "B"]:
 
 
 def one_step_target(
-    batch: Transition, next_value: Float[Array, "B"], config: Config
+    batch: Transition, next_value: Float[Array, "B"], hyper: Hyper
 ) -> Float[Array, "B"]:
     """The target of Eq. (1)."""
-    return td_target(batch.reward, batch.terminated, next_value, config.learner.discount)
+    return td_target(batch.reward, batch.terminated, next_value, hyper.discount)
 
 
 def state_values(value: StateValue, state: Float[Array, "B S"]) -> Float[Array, "B"]:
@@ -158,14 +155,14 @@ def mutual_information(
     return jax.vmap(mutual_information_signal)(mine_scores(mine, state, z))
 
 
-def policy_due(step: Int[Array, ""], config: Config) -> Bool[Array, ""]:
+def policy_due(step: Int[Array, ""], shape: Shape) -> Bool[Array, ""]:
     """Every ``policy_delay``-th step."""
-    return (step + 1) % config.learner.policy_delay == 0
+    return (step + 1) % shape.policy_delay == 0
 
 
-def follow(target: Any, online: Any, step: Int[Array, ""], config: Config) -> Any:
+def follow(target: Any, online: Any, step: Int[Array, ""], shape: Shape, hyper: Hyper) -> Any:
     """Targets move a little towards the networks."""
-    return track(target, online, config.learner.target_update_rate)
+    return track(target, online, hyper.target_update_rate)
 
 
 matd3 = Learner(

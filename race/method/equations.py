@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from race.config.hyper import Number
+
 Scalar = Float[Array, ""]
 Mask = Float[Array, "B"] | None
 
@@ -29,7 +31,7 @@ def td_target(
     reward: Float[Array, "B"],
     terminated: Float[Array, "B"],
     next_value: Float[Array, "B"],
-    discount: float,
+    discount: Number,
 ) -> Float[Array, "B"]:
     """One-step target ``y = r + gamma (1 - terminated) Q'(s', pi(s'))`` inside Eq. (1).
 
@@ -126,7 +128,7 @@ def value_aware_mi_loss(
     return -expectation(weights * signal, mask)
 
 
-def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: float) -> Scalar:
+def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: Number) -> Scalar:
     """Eq. (6): ``L_phi = L_VFM + beta L_VMM``."""
     return vfm + vmm_weight * vmm
 

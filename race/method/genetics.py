@@ -11,11 +11,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from race.config.hyper import Number
 from race.config.settings import MutationDraw
 
 Head = Float[Array, "N H1 A"]
 Heads = Float[Array, "P N H1 A"]
-Number = float | Float[Array, ""]
 
 # Of the weights that mutate, this share is perturbed strongly, and another such share is redrawn;
 # the rest is perturbed weakly. Shares and strengths are those of the genetic algorithm that the

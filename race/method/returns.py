@@ -4,14 +4,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from race.config.hyper import Number
+
 
 def lambda_returns(
     reward: Float[Array, "T *b"],
     terminated: Float[Array, "T *b"],
     next_value: Float[Array, "T *b"],
     acted: Bool[Array, "T *b"],
-    discount: float,
-    td_lambda: float,
+    discount: Number,
+    td_lambda: Number,
 ) -> Float[Array, "T *b"]:
     """TD(lambda) targets of every step of a batch of episodes (Sutton & Barto 2018, Section 12.1).
 

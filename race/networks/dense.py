@@ -64,7 +64,7 @@ class Encoder(eqx.Module):
 
 
 def init_encoder(
-    key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, int], layer_norm: bool
+    key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, ...], layer_norm: bool
 ) -> Encoder:
     """Fresh encoders, one per agent. Rows of padded observation entries are never used."""
     h1, h2 = hidden_sizes

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from race.config.hyper import Number
+
 
 class Trainable(NamedTuple):
     """A network's parameters and the state of its own optimiser."""
@@ -14,11 +16,11 @@ class Trainable(NamedTuple):
     optimizer: optax.OptState
 
 
-def _adam(learning_rate: float, clip: float) -> optax.GradientTransformation:
+def _adam(learning_rate: Number, clip: Number) -> optax.GradientTransformation:
     return optax.chain(_clip_by_global_norm(clip), optax.adam(learning_rate))
 
 
-def _clip_by_global_norm(clip: float) -> optax.GradientTransformation:
+def _clip_by_global_norm(clip: Number) -> optax.GradientTransformation:
     # Optax's own divides every entry in a pass of its own; this factor is multiplied into Adam's.
     def scaled(gradient: Any, params: Any) -> Any:
         squares = [jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(gradient)]
@@ -33,7 +35,7 @@ def init_trainable(params: Any) -> Trainable:
     return Trainable(params, _adam(1.0, 1.0).init(params))
 
 
-def descend(trained: Trainable, gradient: Any, learning_rate: float, clip: float) -> Trainable:
+def descend(trained: Trainable, gradient: Any, learning_rate: Number, clip: Number) -> Trainable:
     """One Adam step along a gradient whose global norm is first clipped to ``clip``."""
     # Optax raises a float to an integer power, which strict promotion, where set, would refuse.
     with jax.numpy_dtype_promotion("standard"):
@@ -41,7 +43,7 @@ def descend(trained: Trainable, gradient: Any, learning_rate: float, clip: float
     return Trainable(optax.apply_updates(trained.params, updates), optimizer)
 
 
-def track(target: Any, online: Any, rate: float) -> Any:
+def track(target: Any, online: Any, rate: Number) -> Any:
     """Moves a target network towards the online one: ``target + rate (online - target)``."""
     return jax.tree.map(lambda t, o: t + rate * (o - t), target, online)
 

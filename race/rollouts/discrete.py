@@ -72,9 +72,9 @@ class EpisodeRollouts:
         how = Exploration(
             jnp.arange(config.n_teams) == config.n_teams - 1,
             jnp.float32(share),
-            jax.random.fold_in(root_key(config, Purpose.ROLLOUT), generation),
+            jax.random.fold_in(root_key(config.seed, Purpose.ROLLOUT), generation),
         )
-        seeds = host_seeds(config, Purpose.ROLLOUT, generation, config.n_teams)
+        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, config.n_teams)
         played = self._play(teams, seeds, how)
         self._check_finite(played, f"generation {generation + 1}")
         replay = programs.store(replay, played.episodes, np.int32(config.n_teams))

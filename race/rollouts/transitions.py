@@ -62,7 +62,7 @@ class TransitionRollouts:
             report(collected)
             missing = config.learner.random_steps - collected
             playing = min(config.n_teams, missing)
-            seeds = host_seeds(config, Purpose.WARM_UP, index, playing + 1)
+            seeds = host_seeds(config.seed, Purpose.WARM_UP, index, playing + 1)
             generator = np.random.default_rng(int(seeds[-1]))
             shape = (playing, spec.joint_action_size)
 
@@ -87,7 +87,7 @@ class TransitionRollouts:
     ) -> tuple[Replay, Generation]:
         """The MARL team's actions are noisy; the population explores by its diversity."""
         config, spec = self._config, self._task.spec
-        seeds = host_seeds(config, Purpose.ROLLOUT, generation, config.n_teams + 1)
+        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, config.n_teams + 1)
         noise = np.random.default_rng(int(seeds[-1]))
         shape, scale = spec.joint_action_size, np.float32(config.learner.exploration_noise)
 

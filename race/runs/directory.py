@@ -139,6 +139,15 @@ def open_run(path: Path) -> Config:
         ) from error
 
 
+def read_metadata(path: Path) -> dict[str, Any]:
+    """What was recorded of the run's origin; nothing where that is missing or damaged."""
+    try:
+        data = json.loads(RunDirectory(path).metadata.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return data if isinstance(data, dict) else {}
+
+
 def mark_finished(path: Path) -> None:
     """Records that the run has used its whole budget.
 

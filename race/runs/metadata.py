@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 
-from race import __version__
+from race import ALGORITHM_VERSION, __version__
 
 DISTRIBUTION = "race-marl"
 
@@ -25,15 +25,16 @@ _EXTRA = re.compile(r"extra\s*==\s*['\"]([^'\"]+)")
 def metadata(environment: Mapping[str, Any]) -> dict[str, Any]:
     """What one needs to know to repeat a run that starts now, as plain JSON values.
 
-    Versions of race and of every installed distribution it needs, directly or not; Python, system
-    and processor; git commit of the source, if it is a checkout; devices; start time; command
-    line; and ``environment`` as it is.
+    Versions of race, of its algorithm (`race.ALGORITHM_VERSION`) and of every installed
+    distribution it needs, directly or not; Python, system and processor; git commit of the source,
+    if it is a checkout; devices; start time; command line; and ``environment`` as it is.
     """
     return {
         "started": datetime.now(UTC).isoformat(timespec="seconds"),
         "command": sys.argv,
         "environment": dict(environment),
         "race": __version__,
+        "algorithm_version": ALGORITHM_VERSION,
         "versions": _versions(),
         "git": _git(Path(__file__).resolve().parent.parent),
         "python": platform.python_version(),

@@ -19,7 +19,8 @@ from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
-from race.training.run_state import Progress, learned_of, progress_of
+from race.training.run_state import Progress
+from race.training.saving import learned_of, progress_of
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
 
 _choose = jax.jit(choose)

@@ -1,47 +1,43 @@
-"""Wall time of a run, kept in its state so that it goes on where an interrupted run was."""
+"""Wall time of a run, which goes on where an interrupted run was."""
 
-import dataclasses
 import time
 from typing import final
-
-import jax
-
-from race.training.run_state import RunState
 
 
 @final
 class Clock:
-    """Wall time of the run, of the generation and since the last checkpoint."""
+    """Wall time of the run, of its current generation and since the last checkpoint.
 
-    def __init__(self, checkpoint_minutes: float) -> None:
+    Args:
+        times: what `times` said when the run was saved, zeros at its start.
+        checkpoint_minutes: between two checkpoints.
+    """
+
+    def __init__(self, times: dict[str, float], checkpoint_minutes: float) -> None:
+        self._wall = times["wall_seconds"]
+        self._generation = times["generation_seconds"]
+        self._rollout = times["rollout_seconds"]
         self._checkpoint_seconds = 60 * checkpoint_minutes
-        self._last = time.perf_counter()
-        self._saved = self._last
-        self._generation = self._last
+        self._last = self._saved = time.perf_counter()
 
-    def begin(self) -> None:
+    def begin_generation(self) -> None:
         """A generation begins."""
-        self._generation = time.perf_counter()
+        self._tick()
+        self._generation = self._rollout = 0.0
 
-    def rolled_out(self, state: RunState) -> RunState:
+    def rolled_out(self) -> None:
         """Its rollouts are over."""
-        jax.block_until_ready(state.replay)
-        seconds = time.perf_counter() - self._generation
-        progress = state.progress.but(rollout_seconds=seconds, generation_seconds=seconds)
-        return self.stamp(state._replace(progress=progress), add=False)
+        self._tick()
+        self._rollout = self._generation
 
-    def stamp(self, state: RunState, add: bool = True) -> RunState:
-        """Brings the times in the state up to now."""
-        now = time.perf_counter()
-        passed, self._last = now - self._last, now
-        progress = state.progress
-        return state._replace(
-            progress=dataclasses.replace(
-                progress,
-                wall_seconds=progress.wall_seconds + passed,
-                generation_seconds=progress.generation_seconds + (passed if add else 0.0),
-            )
-        )
+    def times(self) -> dict[str, float]:
+        """Seconds up to now, by the names they have in `race.training.run_state.Progress`."""
+        self._tick()
+        return {
+            "wall_seconds": self._wall,
+            "generation_seconds": self._generation,
+            "rollout_seconds": self._rollout,
+        }
 
     def checkpoint_due(self) -> bool:
         """Whether enough time has passed since the last checkpoint; if so, it starts again."""
@@ -50,3 +46,9 @@ class Clock:
         if due:
             self._saved = now
         return due
+
+    def _tick(self) -> None:
+        now = time.perf_counter()
+        passed, self._last = now - self._last, now
+        self._wall += passed
+        self._generation += passed

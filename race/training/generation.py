@@ -17,9 +17,8 @@ from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Layout
 from race.replay.packing import layouts
-from race.training.clock import Clock
 from race.training.records import evaluation_row, generation_row
-from race.training.run import Run, save
+from race.training.run import Run, stamped
 from race.training.run_state import RunState
 
 CHUNK = 100
@@ -48,38 +47,40 @@ def warm_up(run: Run, state: RunState) -> RunState:
     return state._replace(replay=replay, progress=progress)
 
 
-def generation(run: Run, state: RunState, clock: Clock) -> RunState:
-    """One pass of Algorithm 1, or the rest of one that a checkpoint broke off.
+def advance(run: Run, state: RunState) -> RunState:
+    """The next piece of a generation: its beginning, some of its gradient steps, or its end.
 
-    Comments name the lines of Algorithm 1. An interrupt leaves the gradient steps half done.
+    Between any two pieces a run can be saved and resumed. Comments name the lines of Algorithm 1.
     """
     if not state.progress.learning:
-        clock.begin()
+        run.clock.begin_generation()
         state = roll_out(run, state)  # 3-6
         state = evolve(run, state)  # 9
-        state = clock.rolled_out(state)
-    while _owed(run, state) > 0:
-        if run.interrupts.requested:
-            return state
-        state = learn(run, state)  # 8, 10, 13
-        if clock.checkpoint_due():
-            state = save(run, clock.stamp(state))
-    algorithm = run.algorithm.inject(state.algorithm)  # 11
-    state = state._replace(algorithm=algorithm, progress=state.progress.but(learning=False))
-    state = clock.stamp(state)
-    row = generation_row(run.config, run.algorithm, state)
+        jax.block_until_ready(state.replay)
+        run.clock.rolled_out()
+        return state
+    if _owed(run, state) > 0:
+        return learn(run, state)  # 8, 10, 13
+    state = inject(run, state)  # 11
+    return test(run, state) if _test_due(run, state) else state
+
+
+def inject(run: Run, state: RunState) -> RunState:
+    """Line 11: the MARL team enters the population; the generation is over and has its row."""
+    algorithm = run.algorithm.inject(state.algorithm)
+    progress = stamped(run, state.progress.but(learning=False))
+    row = generation_row(run.config, run.algorithm, algorithm, state.losses, progress)
     run.metrics.write(row)
-    run.report("generation", state.progress, row)
-    state = state._replace(losses=programs.empty_losses(run.algorithm))
+    run.report("generation", progress, row)
+    losses = programs.empty_losses(run.algorithm)
+    return state._replace(algorithm=algorithm, losses=losses, progress=progress)
+
+
+def _test_due(run: Run, state: RunState) -> bool:
     every, progress = run.config.evaluation.every, state.progress
     assert every is not None
-    if (
-        progress.env_steps // every > progress.evaluated_at // every
-        or progress.env_steps >= run.config.env_steps
-    ):
-        state = test(run, state)
-        state = clock.stamp(state)
-    return state
+    passed = progress.env_steps // every > progress.evaluated_at // every
+    return passed or progress.env_steps >= run.config.env_steps
 
 
 def roll_out(run: Run, state: RunState) -> RunState:
@@ -111,8 +112,10 @@ def evolve(run: Run, state: RunState) -> RunState:
     if not run.config.has_population:
         return state
     fitness = jnp.asarray(state.progress.fitness, jnp.float32)
-    key = jax.random.fold_in(root_key(run.config, Purpose.EVOLUTION), state.progress.generation)
-    algorithm = programs.evolve(state.algorithm, fitness, key, **run.statics)
+    key = jax.random.fold_in(
+        root_key(run.config.seed, Purpose.EVOLUTION), state.progress.generation
+    )
+    algorithm = programs.evolve(state.algorithm, fitness, key, hyper=state.hyper, **run.statics)
     return state._replace(algorithm=algorithm)
 
 
@@ -123,7 +126,7 @@ def learn(run: Run, state: RunState) -> RunState:
         DivergenceError: if a loss is not a finite number.
     """
     progress = state.progress
-    key, first = root_key(run.config, Purpose.LEARNING), np.int32(progress.gradient_steps)
+    key, first = root_key(run.config.seed, Purpose.LEARNING), np.int32(progress.gradient_steps)
     if run.config.discrete:
         # Where a generation's steps are parted depends on nothing but their number, so that a
         # resumed run parts them alike.
@@ -137,6 +140,7 @@ def learn(run: Run, state: RunState) -> RunState:
         key,
         first,
         np.int32(count),
+        hyper=state.hyper,
         **run.statics,
         layouts=laid,
     )
@@ -162,8 +166,8 @@ def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Lay
     config = run.config
     room = max(EPISODES_CHUNK, config.n_teams)
     count = min(room, _owed(run, state))
-    first, shared = np.int32(state.progress.gradient_steps), run.statics["config"]
-    drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, config=shared)
+    first, shape = np.int32(state.progress.gradient_steps), run.statics["shape"]
+    drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, shape=shape)
     places, lengths = (np.asarray(column)[:count] for column in drawn)
     return count, layouts(places, lengths, run.task.spec.episode_limit, room)
 
@@ -187,10 +191,10 @@ def test(run: Run, state: RunState) -> RunState:
     spec, episodes = run.task.spec, config.evaluation.episodes
     assert episodes is not None
     encoder, tested = tested_teams(run.algorithm, state.algorithm, spec, config.has_population)
-    seeds = host_seeds(config, Purpose.EVALUATION, progress.generation, episodes)
+    seeds = host_seeds(config.seed, Purpose.EVALUATION, progress.generation, episodes)
     scores = run.rollouts.test(encoder, tested, seeds)
+    progress = stamped(run, progress.but(evaluated_at=progress.env_steps))
     row = evaluation_row(progress, scores)
-    progress = progress.but(evaluated_at=progress.env_steps)
     run.metrics.write(row)
     run.report("evaluation", progress, row)
     return state._replace(progress=progress)

@@ -6,18 +6,20 @@ from typing import Any
 import numpy as np
 
 from race.algorithms import Algorithm
+from race.algorithms.base import Losses
 from race.config.settings import Config
 from race.rollouts.base import Score
-from race.training.run_state import Progress, RunState
+from race.training.run_state import Progress
 
 
-def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dict[str, Any]:
+def generation_row(
+    config: Config, algorithm: Algorithm, learned: Any, losses: Losses, progress: Progress
+) -> dict[str, Any]:
     """What a generation did: fitness, fate of injected teams, mean losses, speed.
 
     Returns are those of training: the MARL team explores in them. Rates are those of the whole
     run so far; they are None before the first injected team has met its fate.
     """
-    progress = state.progress
     steps = progress.gradient_steps - progress.gradient_steps_before
     delay = config.policy_delay
     policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
@@ -27,10 +29,10 @@ def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dic
         row["population/fitness_max"] = max(progress.fitness)
         row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
         row["population/fitness_min"] = min(progress.fitness)
-        fates = np.asarray(algorithm.injection_counts(state.algorithm)).tolist()
+        fates = np.asarray(algorithm.injection_counts(learned)).tolist()
         for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
             row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
-    for name, total in state.losses.items():
+    for name, total in losses.items():
         count = policy_steps if name in algorithm.policy_losses else steps
         row[f"loss/{name}"] = float(total) / count if count else None
     env_steps = progress.env_steps - progress.env_steps_before
@@ -41,12 +43,16 @@ def generation_row(config: Config, algorithm: Algorithm, state: RunState) -> dic
 
 
 def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str, Any]:
-    """Test results of the MARL team, the champion, and the one of them that is selected.
+    """Test results of the MARL team, the champion, the selected of the two, and the best.
 
-    Selected is the one with the better training return: no test result has a say in it.
+    Selected is the one with the better training return: no test result has a say in it. Best is
+    the one with the better test result, of wins where there are any to be had, which is what the
+    paper's figures show; being the larger of two noisy numbers it is biased upwards.
     """
     row: dict[str, Any] = {"kind": "evaluation", **_counters(progress)}
-    for name, score in {**scores, "selected": scores[progress.selected]}.items():
+    best = max(scores.values(), key=lambda score: (score.win_rate or 0.0, score.mean))
+    named = {**scores, "selected": scores[progress.selected], "best": best}
+    for name, score in named.items():
         row[f"eval/{name}/return_mean"] = score.mean
         row[f"eval/{name}/return_std"] = score.std
         row[f"eval/{name}/length_mean"] = float(score.lengths.mean())

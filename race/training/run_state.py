@@ -1,26 +1,19 @@
-"""The state of a run: everything that a checkpoint holds and a resumed run needs."""
+"""The state of a run: everything that changes, and the numbers its programs take."""
 
 import dataclasses
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses
+from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config
-from race.errors import CheckpointError
+from race.config.shape import shape_of
 from race.networks.optimization import copy
 from race.programs import empty_losses, start
 from race.randomness import Purpose, root_key
 from race.replay.buffer import Replay
-from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
-from race.runs.trees import flatten, restore
 from race.types import Spec
-
-SEGMENT_BYTES = 2**26
 
 
 @dataclass(frozen=True)
@@ -62,6 +55,15 @@ class Progress:
         """Of the MARL team and the champion, the one with the better training return."""
         return "champion" if self.fitness and max(self.fitness) > self.marl_return else "marl"
 
+    @property
+    def times(self) -> dict[str, float]:
+        """What a `race.training.clock.Clock` goes on from."""
+        return {
+            "wall_seconds": self.wall_seconds,
+            "generation_seconds": self.generation_seconds,
+            "rollout_seconds": self.rollout_seconds,
+        }
+
     def but(self, **changes: Any) -> "Progress":
         """The same with some values changed."""
         return dataclasses.replace(self, **changes)
@@ -74,120 +76,21 @@ class RunState(NamedTuple):
     losses: Losses  # sums over the gradient steps of the current generation
     replay: Replay
     progress: Progress
+    hyper: Hyper
 
 
 def statics(config: Config, spec: Spec, algorithm: Algorithm) -> dict[str, Any]:
-    """The static arguments of the compiled programs.
-
-    What no program reads is set to one value, so that runs that differ in it alone share programs.
-    """
-    unread = Config(config.task)
-    shared = dataclasses.replace(
-        config,
-        seed=unread.seed,
-        env_steps=unread.env_steps,
-        env=unread.env,
-        evaluation=unread.evaluation,
-        checkpoint=unread.checkpoint,
-    )
-    return {"algorithm": algorithm, "spec": spec, "config": shared}
+    """The static arguments of the compiled programs."""
+    return {"algorithm": algorithm, "spec": spec, "shape": shape_of(config)}
 
 
 def fresh(config: Config, spec: Spec, algorithm: Algorithm, replay: Replay) -> RunState:
     """The state before the first step, with an empty buffer."""
-    key = root_key(config, Purpose.INIT)
+    key = root_key(config.seed, Purpose.INIT)
     return RunState(
         algorithm=copy(start(key, **statics(config, spec, algorithm))),
         losses=empty_losses(algorithm),
         replay=replay,
         progress=Progress(),
+        hyper=hyper_of(config),
     )
-
-
-def to_arrays(state: RunState) -> tuple[dict[str, Any], dict[str, Any], dict[str, Rows]]:
-    """What `race.runs.checkpoints.save` takes: arrays, info, rows."""
-    replay = state.replay
-    columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
-    rows = Rows(columns, int(replay.inserted), replay.capacity)
-    arrays = flatten({"algorithm": state.algorithm, "losses": state.losses})
-    return arrays, {"progress": dataclasses.asdict(state.progress)}, {"replay": rows}
-
-
-def segment_rows(replay: Replay) -> int:
-    """Items of a file of a checkpoint: of transitions many, of episodes about 64 MB."""
-    item = sum(leaf.nbytes // leaf.shape[0] for leaf in jax.tree.leaves(replay.data))
-    return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // item))
-
-
-def from_checkpoint(
-    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm, replay: Replay
-) -> RunState:
-    """The state that a checkpoint holds; ``replay`` has the shapes of the run's buffer.
-
-    Raises:
-        CheckpointError: if it was written by a run with other networks or another task.
-    """
-    progress = progress_of(saved)
-    trained = learned_of(saved, config, spec, algorithm)
-    filled = _filled(saved, replay)
-    return RunState(trained["algorithm"], trained["losses"], filled, progress)
-
-
-def learned_of(
-    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm
-) -> dict[str, Any]:
-    """The algorithm's state and the loss sums that a checkpoint holds.
-
-    Raises:
-        CheckpointError: if it was written by a run with other networks or another task.
-    """
-    key = root_key(config, Purpose.INIT)
-    template = {
-        "algorithm": start(key, **statics(config, spec, algorithm)),
-        "losses": empty_losses(algorithm),
-    }
-    # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
-    return copy(restore(template, saved.arrays))
-
-
-def progress_of(saved: Checkpoint) -> Progress:
-    """The progress that a checkpoint holds.
-
-    Raises:
-        CheckpointError: if it holds none that this version understands.
-    """
-    values = saved.info.get("progress")
-    names = {f.name for f in dataclasses.fields(Progress)}
-    if not isinstance(values, dict) or set(values) != names:
-        raise CheckpointError(
-            f"The checkpoint {saved.path} was not written by this version of race: its record of "
-            "the run's progress differs. Use the version named in metadata.json."
-        )
-    return Progress(**{**values, "fitness": tuple(values["fitness"])})
-
-
-def _filled(saved: Checkpoint, replay: Replay) -> Replay:
-    """The buffer with what the checkpoint holds."""
-    if "replay" not in saved.rows:
-        raise CheckpointError(f"The checkpoint {saved.path} holds no replay buffer.")
-    rows, capacity = saved.rows["replay"], replay.capacity
-    if rows.size > capacity or rows.inserted > rows.capacity != capacity:
-        raise CheckpointError(
-            f"The checkpoint {saved.path} holds a replay buffer of {rows.capacity} items, "
-            f"which does not go into the {capacity} that config.json asks for. Put "
-            "replay_capacity back to what the run began with."
-        )
-    columns = {}
-    for name, column in replay.data._asdict().items():
-        kept = rows.columns.get(name)
-        if kept is None or kept.shape[1:] != column.shape[1:] or kept.dtype != column.dtype:
-            raise CheckpointError(
-                f"The checkpoint {saved.path} holds experience of another task: its replay "
-                f"column {name} does not fit. Is config.json the one that the run began with?"
-            )
-        if rows.capacity != capacity:
-            larger = np.zeros(column.shape, column.dtype)
-            larger[: rows.size] = kept[: rows.size]
-            kept = larger
-        columns[name] = jnp.array(kept)
-    return Replay(replay.data._replace(**columns), jnp.asarray(rows.inserted, jnp.int32))

@@ -21,10 +21,11 @@ from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.runs.metrics import MetricsWriter
 from race.training.clock import Clock
-from race.training.generation import generation, warm_up
+from race.training.generation import advance, warm_up
 from race.training.interrupts import Interrupts
-from race.training.run import Report, Run, save, silent
-from race.training.run_state import Progress, RunState, fresh, from_checkpoint, progress_of
+from race.training.run import Report, Run, silent
+from race.training.run_state import Progress, RunState, fresh
+from race.training.saving import from_checkpoint, progress_of, save
 
 
 def train(
@@ -88,6 +89,7 @@ def train(
                 metrics=metrics,
                 interrupts=interrupts,
                 report=report,
+                clock=Clock(state.progress.times, config.checkpoint.minutes),
                 began=began,
             )
             try:
@@ -127,16 +129,16 @@ def _last_good(directory: RunDirectory) -> str:
 
 
 def _train(run: Run, state: RunState) -> RunState:
-    clock = Clock(run.config.checkpoint.minutes)
     if state.progress.env_steps == 0:
         state = warm_up(run, state)
         if run.interrupts.requested:
             return state  # there is nothing yet that starting again would not bring back
-        state = save(run, clock.stamp(state))
+        save(run, state)
     while not is_over(run.config, state.progress):
-        state = generation(run, state, clock)
+        state = advance(run, state)
         if run.interrupts.requested:
             break
-        if clock.checkpoint_due():
-            state = save(run, clock.stamp(state))
-    return save(run, clock.stamp(state))
+        if run.clock.checkpoint_due():
+            save(run, state)
+    save(run, state)
+    return state

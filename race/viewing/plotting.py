@@ -1,10 +1,7 @@
-"""Learning curves: runs of one method aggregated, one panel per task."""
+"""Figures of learning curves: runs of one method together, one panel per task."""
 
-import dataclasses
-import difflib
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,17 +9,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
-from scipy import stats
 
-from race.config.settings import Config
-from race.errors import RaceError, RunDirectoryError
-from race.runs import directory as run_directory
-from race.runs import metrics
-from race.runs.directory import RunDirectory
+from race.errors import RaceError
+from race.runs.recorded import Recorded, load
+from race.statistics.intervals import LEAST_SEEDS_OF_A_BAND, bounds_of
+from race.viewing import curves as chosen
+from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ends
 
 FORMATS = (".png", ".svg", ".pdf")
-TEAMS = ("selected", "marl", "champion")
 
 # The paper's colours where it has any.
 _COLOURS = {
@@ -36,251 +30,177 @@ _COLOURS = {
 _DISCRETE_COLOURS = {"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"}
 _OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#17becf", "#bcbd22")
 _AXES = {"return_mean": "test return", "win_rate": "test win rate"}
-_LINES = {"selected": "-", "marl": "--", "champion": ":"}
-_LABELS = {"selected": "selected team", "marl": "MARL team", "champion": "champion"}
+_LINES = {"selected": "-", "marl": "--", "champion": ":", "best": "-."}
+
+Methods = dict[tuple[str, str], list[Curve]]
 
 
 class Summary(NamedTuple):
-    """The last point of a curve."""
+    """The last point of a curve, and which of its runs end before it."""
 
     task: str
     curve: str
     seeds: int
+    """At the last point."""
     env_steps: int
+    """Of the last point; with time on the axis, seconds."""
     mean: float
-    half_width: float  # of the 95% interval; NaN with one seed
+    low: float  # of the 95% interval; NaN with one seed
+    high: float
+    ended_early: tuple[Curve, ...]
 
 
-@dataclass(frozen=True)
-class Curve:
-    """One quantity of one run over environment steps."""
+class Drawn(NamedTuple):
+    """What a figure shows, and the runs that had nothing to show."""
 
-    env_steps: NDArray[np.float64]
-    values: NDArray[np.float64]
-
-
-class Band(NamedTuple):
-    """The mean over seeds and its 95% interval (Student's t), on a common grid."""
-
-    env_steps: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    half_width: NDArray[np.float64]  # NaN with one seed
+    summaries: list[Summary]
+    without: list[str]
 
 
 def plot(
-    directories: Sequence[Path], out: Path, metric: str = "return_mean", team: str = "selected"
-) -> list[Summary]:
-    """Draws ``metric`` of the runs in ``directories`` to ``out``.
+    paths: Sequence[Path],
+    out: Path,
+    metric: str = "return_mean",
+    team: str = "selected",
+    axis: Axis = "env_steps",
+) -> Drawn:
+    """Draws ``metric`` of runs to ``out``.
 
     Args:
-        directories: run directories, or folders of run directories.
+        paths: run directories, folders of them, or archives.
         out: a .png, .svg or .pdf file.
         metric: a quantity of evaluations (``return_mean``, ``win_rate``: of ``team``), or any key
             in ``metrics.jsonl``, such as ``injection/elite_rate``.
-        team: ``selected``, ``marl``, ``champion``, or ``all`` of them.
-
-    Returns:
-        The last point of every curve.
+        team: ``selected``, ``marl``, ``champion``, ``best``, or ``all`` of the first three.
+        axis: what is on the x axis.
 
     Raises:
-        RunDirectoryError: for a directory without a run, or a run without the rows needed.
-        RaceError: for an unknown metric, or a file that cannot be written.
+        RunDirectoryError: for a path without a run, or one that cannot be read.
+        RaceError: if no run has a value, two are the same, or the file cannot be written.
     """
     if out.suffix.lower() not in FORMATS:
         raise RaceError(f"{out} cannot be drawn: the name must end with {', '.join(FORMATS)}.")
-    runs = [(path, run_directory.open_run(path)) for path in _expand(directories)]
-    _refuse_twins(runs)
-    names = _names([config for _, config in runs])
-    curves: dict[str, dict[tuple[str, str], list[Curve]]] = {}
-    read = [metrics.read(RunDirectory(path).metrics) for path, _ in runs]
-    keys_of = {True: set[str](), False: set[str]()}
-    for (_, config), rows in zip(runs, read, strict=True):
-        keys_of[config.has_population] |= {key for row in rows for key in row}
-    of_populations = keys_of[True] - keys_of[False]
-    for (path, config), method, rows in zip(runs, names, read, strict=True):
-        if not rows:
-            raise RunDirectoryError(
-                f"The run in {path} has no rows of metrics yet: wait until its first generation "
-                "is over."
-            )
-        for label, key in _keys(metric, team, config).items():
-            name = f"{method}, {label}" if label else method
-            if not config.has_population and key in of_populations:
-                continue  # a quantity of populations, asked for of several methods
-            curve = _curve(path, rows, key, metric)
-            curves.setdefault(config.task, {}).setdefault((method, name), []).append(curve)
-    columns = 2 if len(curves) == 4 else min(len(curves), 3)
-    rows_of_panels = math.ceil(len(curves) / columns)
-    figure = Figure(figsize=(6.4 * columns, 4.4 * rows_of_panels))
+    runs = load(paths)
+    chosen.refuse_twins(runs)
+    panels, without = _panels(runs, metric, team, axis)
+    if not panels:
+        raise chosen.no_values(runs, metric)
+    columns = 2 if len(panels) == 4 else min(len(panels), 3)
+    rows = math.ceil(len(panels) / columns)
+    figure = Figure(figsize=(6.4 * columns, 4.8 * rows), layout="constrained")
     FigureCanvasAgg(figure)
     found = []
-    for index, (task, methods) in enumerate(sorted(curves.items())):
-        axes = figure.add_subplot(rows_of_panels, columns, index + 1)
-        found += _panel(axes, task, methods, metric)
-    figure.tight_layout()
+    for index, (task, methods) in enumerate(sorted(panels.items())):
+        axes = figure.add_subplot(rows, columns, index + 1)
+        found += _panel(axes, task, methods, metric, axis)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(out, dpi=150)
     except OSError as error:
         raise RaceError(f"{out} cannot be written: {error}.") from error
-    return found
+    return Drawn(found, without)
 
 
-def aggregate(curves: Sequence[Curve]) -> Band:
-    """The mean of several runs where all have values, with a 95% interval of the mean.
-
-    Runs are evaluated at different steps; each is interpolated linearly onto all steps at which
-    any of them was evaluated, within the range that all cover. With n seeds the half width is
-    ``t_{0.975, n-1} s / sqrt(n)``.
-    """
-    first = max(curve.env_steps[0] for curve in curves)
-    last = min(curve.env_steps[-1] for curve in curves)
-    grid = np.unique(np.concatenate([curve.env_steps for curve in curves]))
-    grid = grid[(grid >= first) & (grid <= last)]
-    if not grid.size:
-        return Band(grid, grid, grid)
-    values = np.stack([np.interp(grid, curve.env_steps, curve.values) for curve in curves])
-    n = len(curves)
-    if n == 1:
-        return Band(grid, values[0], np.full(grid.shape, np.nan))
-    half = stats.t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / math.sqrt(n)
-    return Band(grid, values.mean(axis=0), half)
+def _panels(
+    runs: Sequence[Recorded], metric: str, team: str, axis: Axis
+) -> tuple[dict[str, Methods], list[str]]:
+    panels: dict[str, Methods] = {}
+    without = []
+    for run, method in zip(runs, chosen.names_of(runs), strict=True):
+        drawn = False
+        for label, key in chosen.keys(metric, team, run.config).items():
+            curve = chosen.curve_of(run, key, axis)
+            if curve is not None:
+                name = f"{method}, {label}" if label else method
+                methods = panels.setdefault(run.config.task, {})
+                methods.setdefault((run.config.method, name), []).append(curve)
+                drawn = True
+        if not drawn:
+            without.append(run.name)
+    return panels, without
 
 
-def _expand(directories: Sequence[Path]) -> list[Path]:
-    found: list[Path] = []
-    for path in directories:
-        if not path.is_dir():
-            raise RunDirectoryError(f"{path} is not a directory, so it holds no run to draw.")
-        inside = sorted(child.parent for child in path.glob("*/config.json"))
-        found += [path] if (path / "config.json").exists() or not inside else inside
-    return list(dict.fromkeys(found))
-
-
-def _settings(config: Config) -> dict[str, Any]:
-    """What makes two runs the same experiment: everything but seed, length and bookkeeping."""
-    kept = dataclasses.asdict(config)
-    for name in ("seed", "env_steps", "checkpoint"):
-        del kept[name]
-    del kept["env"]["processes"]
-    return {
-        f"{group}.{name}" if isinstance(values, dict) else group: value
-        for group, values in kept.items()
-        for name, value in (values.items() if isinstance(values, dict) else [("", values)])
-    }
-
-
-def _refuse_twins(runs: Sequence[tuple[Path, Config]]) -> None:
-    seen: dict[tuple[int, str], Path] = {}
-    for path, config in runs:
-        twin = seen.setdefault((config.seed, repr(_settings(config))), path)
-        if twin != path:
-            raise RaceError(
-                f"{twin} and {path} are the same experiment with the same seed {config.seed}; "
-                "counted as two seeds they would make the interval too narrow. Name one of them."
-            )
-
-
-def _names(configs: Sequence[Config]) -> list[str]:
-    """Each run's method, with the settings in which runs of one method and task differ."""
-    names = []
-    for config in configs:
-        mine = _settings(config)
-        rivals = [
-            _settings(other)
-            for other in configs
-            if (other.task, other.method) == (config.task, config.method)
-        ]
-        differ = [key for key in mine if any(rival[key] != mine[key] for rival in rivals)]
-        settings = ", ".join(f"{key}={mine[key]}" for key in differ)
-        names.append(f"{config.method} {settings}" if settings else config.method)
-    return names
-
-
-def _keys(metric: str, team: str, config: Config) -> dict[str, str]:
-    """Keys of the rows to draw, by the label that tells a method's curves apart."""
-    if "/" in metric or metric == "wall_seconds" or metric == "gradient_steps":
-        return {"": metric}
-    if team == "all" and config.has_population:
-        return {_LABELS[name]: f"eval/{name}/{metric}" for name in TEAMS}
-    # Without a population there is the MARL team alone, whatever the choice.
-    name = team if config.has_population and team != "all" else "marl"
-    return {"" if team in ("selected", "all") else _LABELS[name]: f"eval/{name}/{metric}"}
-
-
-def _curve(path: Path, rows: list[dict[str, object]], key: str, metric: str) -> Curve:
-    known = {k for row in rows for k, v in row.items() if isinstance(v, int | float)}
-    points = [
-        (float(str(row["env_steps"])), float(str(row[key])))
-        for row in rows
-        if isinstance(row.get(key), int | float) and not isinstance(row.get(key), bool)
-    ]
-    if not points and key.startswith("eval/") and not any(k.startswith("eval/") for k in known):
-        raise RunDirectoryError(
-            f"The run in {path} has not been evaluated yet. Wait for its first evaluation, or "
-            "draw a training quantity such as --metric marl/return."
-        )
-    if not points:
-        short = {k.removeprefix("eval/selected/") for k in known}
-        near = difflib.get_close_matches(metric, sorted(known | short), n=3, cutoff=0.3)
-        raise RaceError(
-            f"The run in {path} has no values of {metric!r}. "
-            + (f"Nearest: {', '.join(near)}. " if near else "")
-            + f"All: {', '.join(sorted(known))}."
-        )
-    steps, values = np.array(points).T
-    return Curve(steps, values)
-
-
-def _panel(
-    axes: Axes, task: str, methods: dict[tuple[str, str], list[Curve]], metric: str
-) -> list[Summary]:
+def _panel(axes: Axes, task: str, methods: Methods, metric: str, axis: Axis) -> list[Summary]:
     found = []
-    spare = iter(_OTHER_COLOURS * 4)
-    colours: dict[str, str] = {}
-    known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
+    colours = _colours(methods)
     for (method, name), runs in sorted(methods.items(), reverse=True):
-        if method not in colours:
-            colours[method] = known.get(method) or next(spare)
-        band = aggregate(runs)
-        if not band.env_steps.size:
-            raise RaceError(
-                f"The runs of {name} on {task} have no range of environment steps in common. "
-                "Train the shorter ones further, or draw them apart."
-            )
-        label = next((n for n, text in _LABELS.items() if name.endswith(text)), "selected")
-        seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
-        axes.plot(
-            band.env_steps,
-            band.mean,
-            color=colours[method],
-            linestyle=_LINES[label],
-            linewidth=1.8 if label == "selected" else 1.1,
-            marker="o" if band.env_steps.size == 1 else None,
-            label=f"{name} ({seeds})",
-        )
-        if len(runs) > 1 and label == "selected":  # bands of all teams would hide the lines
-            low, high = band.mean - band.half_width, band.mean + band.half_width
-            axes.fill_between(
-                band.env_steps, low, high, color=colours[method], alpha=0.18, linewidth=0
-            )
+        band = aggregate(runs, bounds_of(metric))
+        label = next((n for n, text in LABELS.items() if name.endswith(text)), "selected")
+        # Seeds and bands of all teams would hide the lines.
+        with_seeds = label in ("selected", "best") or len(methods) <= 2
+        _draw(axes, band, runs, colours[method, name], _LINES[label], name, with_seeds)
         found.append(
             Summary(
                 task,
                 name,
-                len(runs),
-                int(band.env_steps[-1]),
+                int(band.seeds[-1]),
+                int(band.x[-1]),
                 float(band.mean[-1]),
-                float(band.half_width[-1]),
+                float(band.low[-1]),
+                float(band.high[-1]),
+                tuple(ends(runs)),
             )
         )
+    _frame(axes, task, metric, axis)
+    return found
+
+
+def _draw(
+    axes: Axes, band: Band, runs: list[Curve], colour: str, line: str, name: str, with_seeds: bool
+) -> None:
+    """A mean with what surrounds it; fainter where some of its runs have already ended."""
+    seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
+    style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": 1.8}
+    marker = "o" if band.x.size == 1 else None
+    whole = np.flatnonzero(band.seeds == band.seeds.max())
+    first, last = int(whole[0]), int(whole[-1]) + 1
+    axes.plot(band.x, band.mean, alpha=0.4, **style)
+    axes.plot(
+        band.x[first:last], band.mean[first:last], marker=marker, label=f"{name} ({seeds})", **style
+    )
+    if with_seeds and len(runs) >= LEAST_SEEDS_OF_A_BAND:
+        limits = axes.dataLim.frozen()
+        axes.fill_between(band.x, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
+        axes.dataLim.set(limits)  # axes follow the lines: a wide band is cut off
+    elif with_seeds and len(runs) > 1:
+        for run in runs:
+            axes.plot(run.x, run.values, color=colour, linestyle=line, linewidth=0.7, alpha=0.5)
+    for run in ends(runs):
+        height = np.interp(run.x[-1], band.x, band.mean)
+        axes.plot(run.x[-1], height, marker="x", color=colour, markersize=7)
+
+
+def _colours(methods: Methods) -> dict[tuple[str, str], str]:
+    """A colour for each method, and for each of several experiments with one method."""
+    known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
+    spare: Iterator[str] = iter(_OTHER_COLOURS * 20)
+    taken: dict[tuple[str, str], str] = {}
+    for method, name in sorted(methods, reverse=True):
+        experiment = name.rsplit(", ", 1)[0] if name.endswith(tuple(LABELS.values())) else name
+        if (method, experiment) not in taken:
+            own = known.get(method)
+            free = own is not None and own not in taken.values()
+            taken[method, experiment] = str(own) if free else next(spare)
+        taken[method, name] = taken[method, experiment]
+    return taken
+
+
+def _frame(axes: Axes, task: str, metric: str, axis: Axis) -> None:
     axes.set_title(task)
-    axes.set_xlabel("environment steps (all teams)")
     axes.set_ylabel(_AXES.get(metric, metric))
+    axes.autoscale_view()
     if metric == "win_rate":
         axes.set_ylim(-0.02, 1.02)
+    if axis == "env_steps":
+        axes.set_xlabel("environment steps (all teams)")
+        axes.xaxis.set_major_formatter(
+            lambda x, _: f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k"
+        )
+    else:
+        axes.set_xlabel("wall time (minutes)")
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x / 60:g}")
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.xaxis.set_major_formatter(lambda x, _: f"{x / 1e6:g}M" if x >= 1e6 else f"{x / 1e3:g}k")
-    axes.legend(frameon=False, fontsize="small", loc="upper left")
-    return found
+    axes.legend(
+        frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=1
+    )

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from race.algorithms import Algorithm, algorithm_of, marl, race
+from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config, LearnerConfig
+from race.config.shape import shape_of
 from race.types import EnvSpec
 
 ALGORITHMS = {"race": race, "marl": marl}
@@ -38,8 +40,18 @@ class Case:
         self.population = self.algorithm.teams(self.state, self.spec).heads.shape[0] - 1
         self.fitness = jnp.arange(max(1, self.population), dtype=jnp.float32)
 
+    @property
+    def static(self) -> dict[str, Any]:
+        return {"spec": self.spec, "shape": shape_of(self.config)}
+
+    def config_of(self, **learner: Any) -> Config:
+        """The configuration with some of the learner's settings changed."""
+        return dataclasses.replace(
+            self.config, learner=dataclasses.replace(self.config.learner, **learner)
+        )
+
     def init(self, seed: int) -> Any:
-        return self.algorithm.init(jax.random.key(seed), self.spec, self.config)
+        return self.algorithm.init(jax.random.key(seed), self.spec, shape_of(self.config))
 
 
 @pytest.fixture(
@@ -87,7 +99,7 @@ def test_configurations_name_their_algorithm(case: Case) -> None:
 def test_functions_keep_structure_shapes_and_types(case: Case) -> None:
     """Also weak types: what differs between two calls would be compiled twice."""
     key, step = jax.random.key(0), jnp.int32(0)
-    static = {"spec": case.spec, "config": case.config}
+    static = case.static | {"hyper": hyper_of(case.config)}
     before = jax.eval_shape(lambda s: s, case.state)
     updated, critic_losses, policy_losses = jax.eval_shape(
         partial(case.algorithm.update, **static), case.state, case.batch, step, key
@@ -174,23 +186,28 @@ def test_a_step_traces_once(case: Case, batch_of: Callable[..., Any]) -> None:
 def test_seeds_are_a_leading_axis(case: Case, batch_of: Callable[..., Any]) -> None:
     if case.config.base == "maddpg":
         pytest.skip("the same code as MATD3's")
-    static = {"spec": case.spec, "config": case.config}
     states = [case.init(seed) for seed in (1, 2)]
     batches = [batch_of(case.spec, 3, seed) for seed in (1, 2)]
     keys = jax.random.split(jax.random.key(0))
     stacked, batch = (
         jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees) for trees in (states, batches)
     )
-    together = jax.jit(jax.vmap(partial(case.algorithm.update, **static), in_axes=(0, 0, None, 0)))(
-        stacked, batch, jnp.int32(1), keys
-    )
+    # The runs differ in a number too.
+    configs = [case.config, case.config_of(critic_learning_rate=3e-2, target_update_rate=0.3)]
+    hyper = Hyper(*map(np.stack, zip(*map(hyper_of, configs), strict=True)))
+
+    def update(state: Any, batch: Any, key: Any, hyper: Hyper) -> Any:
+        return case.algorithm.update(state, batch, jnp.int32(1), key, hyper=hyper, **case.static)
+
+    together = jax.jit(jax.vmap(update))(stacked, batch, keys, hyper)
     for seed in range(2):
-        alone = case.update(states[seed], batches[seed], jnp.int32(1), keys[seed])
+        alone = jax.jit(update)(states[seed], batches[seed], keys[seed], hyper_of(configs[seed]))
         for a, b in zip(jax.tree.leaves(together), jax.tree.leaves(alone), strict=True):
             np.testing.assert_allclose(a[seed], b, rtol=1e-4, atol=1e-6)
 
     fitness = jnp.stack([case.fitness, case.fitness[::-1]])
-    evolved = jax.jit(jax.vmap(partial(case.algorithm.evolve, **static)))(stacked, fitness, keys)
+    evolve = partial(case.algorithm.evolve, hyper=hyper_of(case.config), **case.static)
+    evolved = jax.jit(jax.vmap(evolve))(stacked, fitness, keys)
     evolved = jax.vmap(case.algorithm.inject)(evolved)
     for seed in range(2):
         lone = case.algorithm.inject(case.evolve(states[seed], fitness[seed], keys[seed]))
@@ -315,6 +332,32 @@ def test_evolution_touches_the_population_alone_and_never_its_elite(race_case: C
             assert not np.array_equal(after.heads[loser], state.heads[loser])
         for name in ("policies", "critics", "target"):
             assert_equal(getattr(after, name), getattr(state, name))
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_the_next_population_is_elite_parent_copy_offspring_and_marl_team(
+    race_case: Case, compiled: Callable[..., Any], probability: float
+) -> None:
+    state, config = race_case.state, race_case.config
+    mutating = dataclasses.replace(config.race, mutation_probability=probability, elite_copy=True)
+    evolve = compiled(race, "evolve", race_case.spec, dataclasses.replace(config, race=mutating))
+    ranked = [3, 0, 2, 4, 1]  # all teams enter the tournament: the second is the parent
+    fitness = jnp.zeros(5).at[jnp.array(ranked)].set(-jnp.arange(5.0))
+    after = race.inject(evolve(state, fitness, jax.random.key(2)))
+    elite, parent, copy, offspring, marl = (np.asarray(after.heads[team]) for team in ranked)
+    np.testing.assert_array_equal(elite, state.heads[3])
+    np.testing.assert_array_equal(marl, state.policies.head.params)
+    assert int(after.injected) == 1
+    if probability == 0:
+        np.testing.assert_array_equal(parent, state.heads[0])
+        np.testing.assert_array_equal(copy, elite)
+        from_elite = (offspring == elite).all(axis=(1, 2))
+        np.testing.assert_array_equal(from_elite, ~(offspring == parent).all(axis=(1, 2)))
+        assert 0 < from_elite.sum() < 2
+    else:
+        assert not np.array_equal(copy, elite)  # open to mutation as any other
+        # A mutant of the elite: where it changed it is of the elite's agents alone.
+        np.testing.assert_array_equal(copy[:, -1], elite[:, -1])
 
 
 def test_injection_replaces_the_worst_alone(race_case: Case) -> None:

@@ -21,6 +21,7 @@ from race.algorithms import marl, race
 from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
 from race.config.settings import Config
+from race.config.shape import shape_of
 from race.networks.factored import FactoredCritic, FactoredPevfa
 from race.types import EnvSpec
 
@@ -285,7 +286,7 @@ def stepped(
 ) -> Step:
     base, layer_norm = request.param
     config = tiny_config("race", base, learner={"layer_norm": layer_norm})
-    before = separate(race.init(jax.random.key(11), tiny_spec, config))
+    before = separate(race.init(jax.random.key(11), tiny_spec, shape_of(config)))
     batch = batch_of(tiny_spec, B)
     after, critic_losses, policy_losses = compiled(race, "update", tiny_spec, config)(
         before, batch, jnp.int32(1), jax.random.key(5)
@@ -517,7 +518,7 @@ def test_targets_of_both_critics_are_smoothed(
     The losses seen must be those of one of the 8 noises per sample, whatever key drew it.
     """
     config = tiny_config(learner={"smoothing_noise": 1e6, "smoothing_clip": 0.5})
-    before = separate(race.init(jax.random.key(11), tiny_spec, config))
+    before = separate(race.init(jax.random.key(11), tiny_spec, shape_of(config)))
     batch = batch_of(tiny_spec, 2)
     _, losses, _ = compiled(race, "update", tiny_spec, config)(
         before, batch, jnp.int32(0), jax.random.key(2)

@@ -40,7 +40,9 @@ from tiny_episodes import (
 )
 
 from race.algorithms.base import Teams
+from race.config.hyper import hyper_of
 from race.config.settings import Config
+from race.config.shape import shape_of
 from race.learners import facmac
 from race.learners.facmac import Moments, logits
 from race.networks.factored import embedding_shifts, mix
@@ -62,7 +64,9 @@ class Networks:
 
     def __init__(self, config: Config) -> None:
         def fresh(init: Callable[..., Any], seed: int) -> Any:
-            network = jax.jit(partial(init, spec=SPEC, config=config))(jax.random.key(seed))
+            network = jax.jit(partial(init, spec=SPEC, shape=shape_of(config)))(
+                jax.random.key(seed)
+            )
             return jax.tree.map(lambda x: 2.0 * x, network)
 
         self.encoder = fresh(facmac.init_encoder, 0)
@@ -151,7 +155,7 @@ def test_targets_of_a_step_use_the_value_of_the_moment_after_it(
 ) -> None:
     values = np.random.default_rng(0).normal(size=laid.slots.real.shape)
     flat = jnp.asarray(values.reshape(-1), jnp.float32)
-    got = laid.steps(facmac.td_target(laid.slots, flat, config))
+    got = laid.steps(facmac.td_target(laid.slots, flat, hyper_of(config)))
     hyper = config.facmac
     for one, v, y in zip(episodes_of(batch), moments_of(laid, values), got, strict=True):
         expected = lambda_targets(one, v, hyper.discount, hyper.td_lambda)
@@ -192,7 +196,7 @@ def test_an_agent_acts_through_its_own_head(
         if how == "act":
             return np.asarray(facmac.act(z, heads, moments, KEY, SPEC)).argmax(-1)
         if how == "target_action":
-            chosen = facmac.target_action(z, heads, moments, KEY, SPEC, config)
+            chosen = facmac.target_action(z, heads, moments, KEY, SPEC, hyper_of(config))
             return np.asarray(chosen).argmax(-1)
         teams = Teams(nets.encoder, jnp.stack([nets.heads, heads]))
         columns = (moments.obs, moments.state, moments.avail_actions)
@@ -213,8 +217,8 @@ def test_target_actions_are_the_best_available(
 ) -> None:
     z = facmac.encode(nets.encoder, later, SPEC)
     for head in (nets.head, nets.heads):
-        got = facmac.target_action(z, head, later, KEY, SPEC, config)
-        again = facmac.target_action(z, head, later, jax.random.key(9), SPEC, config)
+        got = facmac.target_action(z, head, later, KEY, SPEC, hyper_of(config))
+        again = facmac.target_action(z, head, later, jax.random.key(9), SPEC, hyper_of(config))
         assert jnp.array_equal(got, again)
         for e, one in enumerate(episodes_of(batch)):
             expected = best_actions(float64(nets.encoder), float64(head), one)

@@ -11,6 +11,7 @@ import pytest
 from float64_factored import q_tot, q_tot_team
 
 from race.config.settings import Config
+from race.config.shape import shape_of
 from race.learners import facmac_continuous as facmac
 from race.networks.dense import embed_policy, head_vectors
 from race.networks.factored import embedding_shifts, mix, utility_values
@@ -35,17 +36,17 @@ def config(tiny_config: Callable[..., Config]) -> Config:
 
 @pytest.fixture(scope="module")
 def critic(tiny_spec: EnvSpec, config: Config) -> Any:
-    return enlarged(facmac.init_critic(jax.random.key(0), tiny_spec, config))
+    return enlarged(facmac.init_critic(jax.random.key(0), tiny_spec, shape_of(config)))
 
 
 @pytest.fixture(scope="module")
 def pevfa(tiny_spec: EnvSpec, config: Config) -> Any:
-    return enlarged(facmac.init_pevfa(jax.random.key(1), tiny_spec, config))
+    return enlarged(facmac.init_pevfa(jax.random.key(1), tiny_spec, shape_of(config)))
 
 
 @pytest.fixture(scope="module")
 def head(tiny_spec: EnvSpec, config: Config) -> Any:
-    return facmac.init_heads(jax.random.key(2), tiny_spec, config)
+    return facmac.init_heads(jax.random.key(2), tiny_spec, shape_of(config))
 
 
 @pytest.fixture(scope="module")
@@ -175,8 +176,8 @@ def test_initial_ranges_and_no_two_agents_alike(tiny_config: Callable[..., Confi
     config = tiny_config(
         "race", "facmac", {"hidden_sizes": (300, 200)}, {"policy_embedding_size": 40}
     )
-    fresh = facmac.init_critic(jax.random.key(0), spec, config)
-    extended = facmac.init_pevfa(jax.random.key(1), spec, config)
+    fresh = facmac.init_critic(jax.random.key(0), spec, shape_of(config))
+    extended = facmac.init_pevfa(jax.random.key(1), spec, shape_of(config))
     for further, critic in ((0, fresh), (40, extended.critic)):
         first = critic.utilities.first
         # The range follows from an agent's own entries, not from the padded ones.

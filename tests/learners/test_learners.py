@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from race.config.hyper import hyper_of
 from race.config.presets import resolve
 from race.config.settings import Config, LearnerConfig
+from race.config.shape import shape_of
 from race.learners import LEARNERS, facmac, learner_of
 from race.learners.base import Learner
 from race.learners.matd3 import smooth
@@ -24,10 +26,10 @@ def test_number_of_critics(
 ) -> None:
     learner, config = LEARNERS[base], tiny_config("race", base)
     state, action = jnp.ones((3, 4)), jnp.zeros((3, 3))
-    critic = learner.init_critic(jax.random.key(0), tiny_spec, config)
-    pevfa = learner.init_pevfa(jax.random.key(1), tiny_spec, config)
-    head = learner.init_head(jax.random.key(2), tiny_spec, config)
-    encoder = learner.init_encoder(jax.random.key(3), tiny_spec, config)
+    critic = learner.init_critic(jax.random.key(0), tiny_spec, shape_of(config))
+    pevfa = learner.init_pevfa(jax.random.key(1), tiny_spec, shape_of(config))
+    head = learner.init_head(jax.random.key(2), tiny_spec, shape_of(config))
+    encoder = learner.init_encoder(jax.random.key(3), tiny_spec, shape_of(config))
     q_marl = learner.q_marl(critic, state, action, tiny_spec)
     q_team = learner.q_team(pevfa, state, action, head, tiny_spec)
     assert q_marl.shape == q_team.shape == (count, 3)
@@ -46,7 +48,7 @@ def test_heads_of_both_kinds_of_teams_are_one_per_agent(
 ) -> None:
     learner, config = LEARNERS[base], tiny_config("race", base)
     for init in (learner.init_head, learner.init_heads):
-        assert init(KEY, tiny_spec, config).shape == (2, 5, 2)
+        assert init(KEY, tiny_spec, shape_of(config)).shape == (2, 5, 2)
 
 
 @pytest.mark.parametrize("base", LEARNERS)
@@ -70,7 +72,7 @@ def test_a_minibatch_is_its_transitions(
     assert jnp.array_equal(action, batch.action)
     assert jnp.array_equal(learner.later(batch, tiny_spec), batch.next_state)
     # The second sample terminated.
-    y = learner.td_target(batch, jnp.array([10.0, 20.0, 30.0]), config)
+    y = learner.td_target(batch, jnp.array([10.0, 20.0, 30.0]), hyper_of(config))
     np.testing.assert_allclose(y, batch.reward + jnp.array([9.9, 0.0, 29.7]), rtol=1e-6)
 
 
@@ -79,7 +81,7 @@ def test_policies_are_due_after_every_delay(
     tiny_config: Callable[..., Config], base: str, delay: int
 ) -> None:
     learner, config = LEARNERS[base], tiny_config("race", base)
-    due = [bool(learner.policy_due(jnp.int32(step), config)) for step in range(6)]
+    due = [bool(learner.policy_due(jnp.int32(step), shape_of(config))) for step in range(6)]
     assert due == [(step + 1) % delay == 0 for step in range(6)]
 
 
@@ -90,14 +92,14 @@ def test_a_configuration_names_its_learner(base: str, discrete: bool) -> None:
         pytest.skip("there is one learner of discrete actions")
     config = resolve(Config(task="t", base=base), discrete=discrete)  # type: ignore[arg-type]
     expected = facmac if discrete else LEARNERS[base]
-    assert learner_of(config) is expected
+    assert learner_of(shape_of(config)) is expected
     alone = resolve(Config(task="t", algo=base), discrete=discrete)  # type: ignore[arg-type]
     assert learner_of(alone) is expected
 
 
 def smoothed(action: Any, **settings: float) -> np.ndarray:
     config = Config(task="t", learner=LearnerConfig(**settings))  # type: ignore[arg-type]
-    return np.asarray(smooth(action, jax.random.key(4), config))
+    return np.asarray(smooth(action, jax.random.key(4), hyper_of(config)))
 
 
 def test_smoothing_is_clipped_gaussian_noise() -> None:
@@ -126,12 +128,14 @@ def actions(
     learner: Learner, spec: EnvSpec, config: Config, key: jax.Array
 ) -> tuple[np.ndarray, np.ndarray]:
     """A team's actions in 50 states, and those at which a target is evaluated."""
-    encoder = learner.init_encoder(jax.random.key(1), spec, config)
-    head = learner.init_head(jax.random.key(2), spec, config)
+    encoder = learner.init_encoder(jax.random.key(1), spec, shape_of(config))
+    head = learner.init_head(jax.random.key(2), spec, shape_of(config))
     state = jax.random.normal(jax.random.key(3), (50, spec.state_size))
     z = learner.encode(encoder, state, spec)
     plain = learner.act(z, head, state, key, spec)
-    return np.asarray(plain), np.asarray(learner.target_action(z, head, state, key, spec, config))
+    return np.asarray(plain), np.asarray(
+        learner.target_action(z, head, state, key, spec, hyper_of(config))
+    )
 
 
 def test_matd3s_targets_are_at_smoothed_actions_of_the_policies(
@@ -156,4 +160,4 @@ def test_maddpg_and_facmac_are_neither_smoothed_nor_delayed(tiny_spec: EnvSpec, 
     assert np.array_equal(plain, target)
     assert config.learner.policy_delay == 1
     action = jnp.full((3, 2), 0.3)
-    assert jnp.array_equal(smooth(action, jax.random.key(0), config), action)
+    assert jnp.array_equal(smooth(action, jax.random.key(0), hyper_of(config)), action)

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from race.algorithms import race
+from race.config.hyper import hyper_of
 from race.config.presets import resolve
 from race.config.settings import Config, FacmacConfig
+from race.config.shape import shape_of
 from race.envs import make_discrete_task
 from race.learners import facmac
 from race.method.equations import marl_policy_loss, td_loss
@@ -31,7 +33,7 @@ def gradients() -> dict[str, Any]:
         Config(spec.task, facmac=FacmacConfig(hidden_size=16, utility_sizes=(16, 16))),
         discrete=True,
     )
-    state = race.init(jax.random.key(0), spec, config)
+    state = race.init(jax.random.key(0), spec, shape_of(config))
     seeds = np.arange(EPISODES, dtype=np.uint32)
     teams = race.teams(state, spec)
     exact = play(device(), teams, seeds, None, spec, "float32").episodes
@@ -45,9 +47,11 @@ def gradients() -> dict[str, Any]:
         now, taken, mask = facmac.now(batch, spec)
         later = facmac.later(batch, spec)
         z = jax.lax.stop_gradient(facmac.encode(encoder, later, spec))
-        action = facmac.target_action(z, head, later, jax.random.key(1), spec, config)
+        action = facmac.target_action(z, head, later, jax.random.key(1), spec, hyper_of(config))
         target_critic = jax.lax.stop_gradient(critic)
-        y = facmac.td_target(batch, facmac.q_marl(target_critic, later, action, spec)[0], config)
+        y = facmac.td_target(
+            batch, facmac.q_marl(target_critic, later, action, spec)[0], hyper_of(config)
+        )
         critic_loss = td_loss(facmac.q_marl(critic, now, taken, spec), y, mask)
         chosen = facmac.act(facmac.encode(encoder, now, spec), head, now, jax.random.key(2), spec)
         policy = marl_policy_loss(facmac.q_marl(target_critic, now, chosen, spec)[0], mask)

@@ -14,6 +14,7 @@ import pytest
 from race.algorithms.base import Teams
 from race.config.presets import resolve
 from race.config.settings import Config, FacmacConfig, RaceConfig
+from race.config.shape import shape_of
 from race.envs import make_discrete_task
 from race.errors import DivergenceError, TaskError
 from race.learners.facmac import logits, new_encoder
@@ -53,7 +54,7 @@ def task_of(name: str) -> DiscreteTask:
 def teams_of(spec: DiscreteSpec, count: int, seed: int = 0) -> Teams:
     """Teams that differ, and whose agents do."""
     encoder_key, head_key = jax.random.split(jax.random.key(seed))
-    encoder = new_encoder(encoder_key, spec, config_of(spec.task))
+    encoder = new_encoder(encoder_key, spec, shape_of(config_of(spec.task)))
     shape = (count, spec.n_agents, 7, spec.n_actions)
     return Teams(encoder, 3.0 * jax.random.normal(head_key, shape))
 

@@ -13,8 +13,10 @@ import pytest
 
 from race import programs
 from race.algorithms import algorithm_of
+from race.config.hyper import hyper_of
 from race.config.presets import resolve
 from race.config.settings import Config, EnvConfig, LearnerConfig, RaceConfig
+from race.config.shape import shape_of
 from race.envs import make_task
 from race.envs.probe import LAST, ChainEnv, TargetEnv
 from race.learners import learner_of
@@ -51,14 +53,21 @@ class Learned:
             )
         )
         self.config, self.spec = config, task.spec
-        self.algorithm, self.learner = algorithm_of(config), learner_of(config)
+        self.algorithm, self.learner = algorithm_of(config), learner_of(shape_of(config))
         fixed = statics(config, task.spec, self.algorithm)
         state = programs.start(jax.random.key(0), **fixed)
         replay = store(init_replay(empty_transition(task.spec), max(len(data.reward), 2048)), data)
         sums = programs.empty_losses(self.algorithm)
         zero, count = np.int32(0), np.int32(steps)
         self.state, _ = programs.learn(
-            jax.tree.map(jnp.copy, state), sums, replay, jax.random.key(1), zero, count, **fixed
+            jax.tree.map(jnp.copy, state),
+            sums,
+            replay,
+            jax.random.key(1),
+            zero,
+            count,
+            hyper=hyper_of(config),
+            **fixed,
         )
 
     def act(self, states: np.ndarray) -> np.ndarray:

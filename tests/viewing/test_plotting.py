@@ -12,7 +12,10 @@ from race.config import settings as configs
 from race.config.presets import resolve
 from race.config.settings import Config, LearnerConfig
 from race.errors import RaceError, RunDirectoryError
-from race.viewing.plotting import Curve, aggregate, plot
+from race.statistics.intervals import mean_interval
+from race.viewing import plotting
+from race.viewing.curves import Curve, aggregate, ends
+from race.viewing.plotting import plot
 
 
 def make_run(path: Path, points: list[tuple[int, float]], **settings: Any) -> Path:
@@ -33,23 +36,35 @@ def make_run(path: Path, points: list[tuple[int, float]], **settings: Any) -> Pa
     return path
 
 
-def test_the_interval_of_three_seeds_by_hand() -> None:
-    grid = np.array([0.0, 10.0])
-    runs = [Curve(grid, np.array([v, 2 * v])) for v in (1.0, 2.0, 6.0)]
-    band = aggregate(runs)
-    np.testing.assert_allclose(band.mean, [3.0, 6.0])
-    # s = sqrt((4 + 1 + 9) / 2) = sqrt(7); t(0.975, 2) = 4.302653; half = t s / sqrt(3).
-    half = 4.302653 * np.sqrt(7.0) / np.sqrt(3.0)
-    np.testing.assert_allclose(band.half_width, [half, 2 * half], rtol=1e-6)
-
-
 def test_runs_evaluated_at_different_steps_meet_on_a_common_grid() -> None:
     first = Curve(np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 20.0]))
-    second = Curve(np.array([5.0, 15.0, 40.0]), np.array([5.0, 15.0, 40.0]))
+    second = Curve(np.array([0.0, 15.0, 20.0]), np.array([2.0, 17.0, 22.0]))
     band = aggregate([first, second])
-    assert band.env_steps.tolist() == [5.0, 10.0, 15.0, 20.0]
-    np.testing.assert_allclose(band.mean, band.env_steps)
-    np.testing.assert_allclose(band.half_width, 0.0, atol=1e-12)
+    assert band.x.tolist() == [0.0, 10.0, 15.0, 20.0]
+    np.testing.assert_allclose(band.mean, band.x + 1.0)
+    assert band.seeds.tolist() == [2] * 4
+    # t(0.975, 1) = 12.7062; s = sqrt(2); half = t.
+    np.testing.assert_allclose(band.high - band.mean, 12.7062047, rtol=1e-6)
+
+
+def test_a_run_that_stopped_early_does_not_cut_the_others() -> None:
+    whole = [Curve(np.array([0.0, 10.0, 20.0]), np.full(3, v), i) for i, v in enumerate((1.0, 2.0))]
+    short = Curve(np.array([0.0, 10.0]), np.array([6.0, 6.0]), 7)
+    band = aggregate([*whole, short])
+    assert band.x.tolist() == [0.0, 10.0, 20.0]
+    np.testing.assert_allclose(band.mean, [3.0, 3.0, 1.5])
+    assert band.seeds.tolist() == [3, 3, 2]
+    assert [run.seed for run in ends([*whole, short])] == [7]
+    assert ends(whole) == []
+
+
+def test_runs_without_a_common_range_are_each_where_they_are() -> None:
+    band = aggregate(
+        [Curve(np.array([0.0, 1.0]), np.ones(2)), Curve(np.array([5.0, 6.0]), np.zeros(2))]
+    )
+    assert band.x.tolist() == [0.0, 1.0, 5.0, 6.0]
+    assert band.mean.tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert np.isnan(band.low).all()
 
 
 def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
@@ -58,7 +73,7 @@ def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
     make_run(tmp_path / "matd3", [(100, 1.0), (200, 2.0)], algo="matd3")
     make_run(tmp_path / "ant", [(100, 7.0), (300, 8.0)], task="mamujoco/Ant-2x4")
     out = tmp_path / "figures" / "curves.png"
-    found = {(row.task, row.curve): row for row in plot([tmp_path], out)}
+    found = {(row.task, row.curve): row for row in plot([tmp_path], out).summaries}
     assert set(found) == {
         ("mamujoco/Hopper-3x1", "RACE(MATD3)"),
         ("mamujoco/Hopper-3x1", "MATD3"),
@@ -67,7 +82,8 @@ def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
     race = found["mamujoco/Hopper-3x1", "RACE(MATD3)"]
     assert (race.seeds, race.env_steps) == (2, 200)
     assert race.mean == pytest.approx(125.0)
-    assert race.half_width == pytest.approx(12.706205 * np.std([110, 140], ddof=1) / np.sqrt(2))
+    expected = mean_interval([110.0, 140.0])
+    assert (race.low, race.high) == pytest.approx((expected.low, expected.high))
     assert found["mamujoco/Hopper-3x1", "MATD3"].mean == pytest.approx(2.0)
     image = iio.imread(out)[..., :3]
     red = (image[..., 0] > 180) & (image[..., 1] < 90) & (image[..., 2] < 90)
@@ -77,19 +93,21 @@ def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
 def test_teams_and_other_quantities(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", [(100, 50.0), (200, 60.0)])
     out = tmp_path / "curves.svg"
-    teams = {row.curve: row.mean for row in plot([run], out, team="all")}
+    teams = {row.curve: row.mean for row in plot([run], out, team="all").summaries}
     assert teams == {
         "RACE(MATD3), selected team": 70.0,
         "RACE(MATD3), champion": 70.0,
         "RACE(MATD3), MARL team": 60.0,
     }
-    (rate,) = plot([run], out, metric="injection/elite_rate")
+    (rate,) = plot([run], out, metric="injection/elite_rate").summaries
     assert rate.mean == pytest.approx(0.06)
     # Asked for of several methods, a quantity of populations is drawn for those that have one.
     other = make_run(tmp_path / "other", [(100, 50.0), (200, 60.0)], algo="matd3")
     rows = (other / "metrics.jsonl").read_text().replace("injection/elite_rate", "marl/return")
     (other / "metrics.jsonl").write_text(rows)
-    assert len(plot([run, other], out, metric="injection/elite_rate")) == 1
+    drawn = plot([run, other], out, metric="injection/elite_rate")
+    assert len(drawn.summaries) == 1
+    assert drawn.without == [str(other)]
     assert out.read_text().lstrip().startswith("<?xml")
 
 
@@ -98,7 +116,9 @@ def test_runs_with_other_settings_are_other_curves(tmp_path: Path) -> None:
     make_run(tmp_path / "a", [(100, 1.0), (200, 2.0)], algo="matd3", env_steps=20_000)
     make_run(tmp_path / "b", [(100, 1.0), (200, 4.0)], algo="matd3", env_steps=30_000, seed=2)
     make_run(tmp_path / "c", [(100, 1.0), (200, 8.0)], algo="matd3", learner=small)
-    found = {row.curve: (row.seeds, row.mean) for row in plot([tmp_path], tmp_path / "a.png")}
+    found = {
+        row.curve: (row.seeds, row.mean) for row in plot([tmp_path], tmp_path / "a.png").summaries
+    }
     assert found == {
         "MATD3 learner.batch_size=128": (2, 3.0),
         "MATD3 learner.batch_size=32": (1, 8.0),
@@ -124,12 +144,67 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
     with pytest.raises(RunDirectoryError, match="not the directory of a run"):
         plot([tmp_path / "empty"], tmp_path / "a.png")
     young = make_run(tmp_path / "young", [], seed=2)
-    with pytest.raises(RunDirectoryError, match="no rows"):
+    with pytest.raises(RaceError, match="no rows"):
         plot([young], tmp_path / "a.png")
     row = {"kind": "generation", "env_steps": 5, "marl/return": 1.0}
     (young / "metrics.jsonl").write_text(json.dumps(row) + "\n")
-    with pytest.raises(RunDirectoryError, match="not been evaluated"):
+    with pytest.raises(RaceError, match="not been an evaluation"):
         plot([young], tmp_path / "a.png")
-    far = make_run(tmp_path / "far", [(500, 1.0), (600, 1.0)], seed=3)
-    with pytest.raises(RaceError, match="no range"):
-        plot([run, far], tmp_path / "a.png")
+    # Beside others it is left out, and said to be.
+    drawn = plot([run, young], tmp_path / "a.png")
+    assert [summary.seeds for summary in drawn.summaries] == [1]
+    assert drawn.without == [str(young)]
+
+
+def lines_of(monkeypatch: pytest.MonkeyPatch, paths: list[Path], out: Path, **how: Any) -> Any:
+    """The axes of the one panel of a figure."""
+    panels = []
+    frame = plotting._frame
+
+    def spy(axes: Any, *rest: Any) -> None:
+        frame(axes, *rest)
+        panels.append(axes)
+
+    monkeypatch.setattr(plotting, "_frame", spy)
+    plot(paths, out, **how)
+    return panels[0]
+
+
+@pytest.mark.parametrize("seeds", [2, 3, 4])
+def test_few_seeds_are_shown_themselves_and_many_as_a_band(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seeds: int
+) -> None:
+    for seed in range(1, seeds + 1):
+        make_run(tmp_path / f"s{seed}", [(100, 100.0 * seed), (200, 100.0)], seed=seed)
+    axes = lines_of(monkeypatch, [tmp_path], tmp_path / "a.png")
+    assert len(axes.collections) == (1 if seeds == 4 else 0)
+    thin = [line for line in axes.lines if line.get_linewidth() < 1]
+    assert len(thin) == (0 if seeds == 4 else seeds)
+
+
+def test_axes_follow_the_lines_and_not_the_band(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for seed, value in enumerate((0.0, 0.0, 0.0, 4000.0), 1):
+        make_run(tmp_path / f"s{seed}", [(100, value), (200, value)], algo="matd3", seed=seed)
+    low, high = lines_of(monkeypatch, [tmp_path], tmp_path / "a.png").get_ylim()
+    assert 900 < low < 1000 < high < 1100  # the mean is 1,000, the interval -2,182 to 4,182
+
+
+def test_the_band_of_a_share_stays_within_0_and_1(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for seed, value in enumerate((0.0, 300.0, 900.0, 1000.0), 1):
+        make_run(tmp_path / f"s{seed}", [(100, value), (200, 1000.0)], seed=seed)
+    axes = lines_of(monkeypatch, [tmp_path], tmp_path / "a.png", metric="injection/elite_rate")
+    heights = axes.collections[0].get_paths()[0].vertices[:, 1]
+    assert heights.min() == 0.0
+    assert heights.max() == 1.0
+
+
+def test_wall_time_on_the_axis(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "run", [(100, 50.0), (200, 60.0)])
+    text = (run / "metrics.jsonl").read_text()
+    (run / "metrics.jsonl").write_text(text.replace('"env_steps": 200', '"wall_seconds": 90.0'))
+    (summary,) = plot([run], tmp_path / "a.png", axis="wall_time").summaries
+    assert summary.env_steps == 90

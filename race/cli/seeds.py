@@ -1,0 +1,231 @@
+"""Several seeds of one run at once, each in a process and a directory of its own.
+
+The directories are made here; every process is then `race resume` of one of them, so that a first
+start and a later one are the same thing.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType, TracebackType
+from typing import Any, final
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from race.cli.progress import duration, test_summary
+from race.config.settings import Config
+from race.errors import ConfigError, RunDirectoryError
+from race.runs import directory as run_directory
+from race.runs import metrics
+from race.runs.directory import RunDirectory
+
+LOOK_EVERY = 0.5
+"""Seconds between two looks at the runs."""
+_INTERRUPTED = 130
+_SINGLE_THREADED = {
+    "OMP_NUM_THREADS": "1",
+    "OPENBLAS_NUM_THREADS": "1",
+    "MKL_NUM_THREADS": "1",
+}
+
+
+def parse_seeds(text: str) -> list[int]:
+    """The seeds of ``1-5``, ``1,4,7`` or ``1-3,9``.
+
+    Raises:
+        ConfigError: if it is none of these, or names a seed twice.
+    """
+    seeds: list[int] = []
+    try:
+        for part in text.split(","):
+            first, dash, last = part.strip().partition("-")
+            numbers = range(int(first), int(last if dash else first) + 1)
+            if not numbers:
+                raise ValueError("an empty range")
+            seeds += numbers
+    except ValueError as error:
+        raise ConfigError(
+            f"--seeds is {text!r}, but it must be like 1-5, or 1,4,7, or 1-3,9."
+        ) from error
+    if len(set(seeds)) < len(seeds):
+        raise ConfigError(f"--seeds is {text!r}, which names a seed twice.")
+    return seeds
+
+
+def directories_of(path: Path) -> list[Path]:
+    """The runs of several seeds in ``path``, in order of their seeds; none if it holds none."""
+    found = [file.parent for file in path.glob("seed*/config.json")]
+    return sorted(found, key=lambda run: (len(run.name), run.name))
+
+
+@final
+class Worker:
+    """A run and, once started, its process, whose words go to ``log.txt`` beside its metrics."""
+
+    def __init__(self, path: Path, config: Config) -> None:
+        self.path, self.config = path, config
+        self.process: subprocess.Popen[bytes] | None = None
+        self.core: int | None = None
+        self.ended: str | None = "finished" if run_directory.is_finished(path) else None
+        self.row: dict[str, Any] = {}
+        self.test: dict[str, Any] = {}
+        self._read_to = 0
+
+    def start(self, core: int | None, env_steps: int | None) -> None:
+        """Goes on with the run, on one core if one is named."""
+        extend = [] if env_steps is None else ["--env-steps", str(env_steps)]
+        command = [sys.executable, "-m", "race", "resume", str(self.path), *extend]
+        environment = os.environ | ({} if core is None else _SINGLE_THREADED)
+        with (self.path / "log.txt").open("ab") as log:
+            # A session of its own: Ctrl-C reaches this process, which passes it on once.
+            self.process = subprocess.Popen(
+                command, stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+        self.core = core
+        if core is not None and hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(self.process.pid, {core})
+
+    def look(self) -> list[dict[str, Any]]:
+        """Reads what the run has written since the last look; returns its new evaluations."""
+        file = RunDirectory(self.path).metrics
+        rows = metrics.read(file) if file.exists() else []
+        new = rows[self._read_to :] if len(rows) >= self._read_to else []
+        self._read_to = len(rows)
+        evaluations = [row for row in new if row["kind"] == "evaluation"]
+        self.row = rows[-1] if rows else self.row
+        self.test = evaluations[-1] if evaluations else self.test
+        if self.process is not None and (code := self.process.poll()) is not None:
+            self.process = None
+            self.ended = {0: "finished", _INTERRUPTED: "interrupted"}.get(code, "failed")
+        return evaluations
+
+    @property
+    def stage(self) -> str:
+        """What a person is told of it."""
+        return self.ended or ("training" if self.process else "waiting")
+
+    def complaint(self) -> str:
+        """The last lines that a failed run said."""
+        lines = (self.path / "log.txt").read_text(errors="replace").strip().splitlines()
+        return "\n".join(lines[-3:])
+
+
+@final
+class _Signals:
+    """The first SIGINT or SIGTERM asks the runs to save and stop; a second ends them at once."""
+
+    def __init__(self, workers: Sequence[Worker]) -> None:
+        self.requested = False
+        self._workers = workers
+        self._previous: dict[int, Any] = {}
+
+    def __enter__(self) -> "_Signals":
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._previous[number] = signal.signal(number, self._pass_on)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        for worker in self._workers:  # none is left where all went well
+            if worker.process is not None:
+                worker.process.terminate()
+
+    def _pass_on(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        for worker in self._workers:
+            if worker.process is not None:
+                worker.process.send_signal(signal.SIGINT)
+
+
+def run_all(
+    path: Path, jobs: int | None, env_steps: int | None = None, console: Console | None = None
+) -> None:
+    """Trains every unfinished run in ``path``, some at a time. Exits with 130 on Ctrl-C.
+
+    Args:
+        path: the folder that holds them.
+        jobs: runs at a time; None: as many as cores. Each has a core of its own where there are
+            enough.
+        env_steps: a new budget for all.
+        console: where it is shown.
+
+    Raises:
+        RunDirectoryError: if a run failed; the others are trained to their end first.
+    """
+    console = console or Console()
+    workers = [Worker(run, run_directory.open_run(run)) for run in directories_of(path)]
+    for worker in workers:
+        if env_steps is not None:
+            worker.ended = None
+        worker.look()
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    jobs = min(jobs or max(len(cores), 1), len(workers))
+    free: list[int | None] = [*cores[:jobs]] if 1 < jobs <= len(cores) else [None] * jobs
+    with (
+        _Signals(workers) as signals,
+        Live(console=console, refresh_per_second=2, transient=True) as live,
+    ):
+        while True:
+            waiting = [w for w in workers if w.ended is None and w.process is None]
+            if waiting and free and not signals.requested:
+                waiting[0].start(free.pop(0), env_steps)
+                continue
+            for worker in workers:
+                busy = worker.process is not None
+                for row in worker.look():
+                    console.print(_line(worker, row), highlight=False, soft_wrap=True)
+                if busy and worker.process is None:
+                    free.append(worker.core)
+                    console.print(f"seed {worker.config.seed}: {worker.stage}", highlight=False)
+            live.update(_table(workers, env_steps))
+            if not any(w.process for w in workers) and (signals.requested or not waiting):
+                break
+            time.sleep(LOOK_EVERY)
+    _say_how_it_ended(path, workers, console)
+
+
+def _say_how_it_ended(path: Path, workers: Sequence[Worker], console: Console) -> None:
+    failed = [worker for worker in workers if worker.ended == "failed"]
+    if failed:
+        raise RunDirectoryError(
+            "\n".join(f"Seed {w.config.seed} failed, in {w.path}: {w.complaint()}" for w in failed)
+        )
+    if any(worker.ended != "finished" for worker in workers):
+        message = f"Interrupted and saved. Go on with: race resume {path}"
+        console.print(message, highlight=False, soft_wrap=True)
+        sys.exit(_INTERRUPTED)
+    message = f"All {len(workers)} seeds have finished. Next: race plot {path} --out curves.png"
+    console.print(message, highlight=False, soft_wrap=True)
+
+
+def _line(worker: Worker, row: dict[str, Any]) -> str:
+    return (
+        f"seed {worker.config.seed}: {row['env_steps']:>9,} steps, "
+        f"{duration(row['wall_seconds']):>7}: test return {test_summary(row)}"
+    )
+
+
+def _table(workers: Sequence[Worker], env_steps: int | None) -> Table:
+    table = Table("seed", "state", "steps", "time", "test return", box=None, pad_edge=False)
+    for worker in workers:
+        steps, total = worker.row.get("env_steps", 0), env_steps or worker.config.env_steps
+        table.add_row(
+            str(worker.config.seed),
+            worker.stage,
+            f"{steps:,} of {total:,} ({min(steps / total, 1.0):.0%})",
+            duration(worker.row.get("wall_seconds", 0.0)),
+            test_summary(worker.test) if worker.test else "",
+        )
+    return table

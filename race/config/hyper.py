@@ -1,0 +1,60 @@
+"""`Hyper`: every number that the compiled programs take as an argument."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from race.config.settings import Config
+
+Number = float | Float[Any, ""]
+
+
+class Hyper(NamedTuple):
+    """Numbers of the method and the learner, each a float32 scalar.
+
+    Runs that differ in these alone share one program, and can be rows of one array. What a learner
+    has no use for is NaN, so that a use of it would show.
+    """
+
+    actor_learning_rate: Number
+    critic_learning_rate: Number
+    gradient_clip: Number
+    discount: Number
+    """gamma"""
+    target_update_rate: Number
+    """tau; on discrete actions targets are copied instead (`Shape.target_update_every`)."""
+    smoothing_noise: Number
+    smoothing_clip: Number
+    td_lambda: Number
+    """lambda of FACMAC's targets on discrete actions."""
+    mutation_fraction: Number
+    """alpha"""
+    mutation_probability: Number
+    agent_mutation_probability: Number
+    vmm_weight: Number
+    """beta, the weight of Eq. (5) in Eq. (6)."""
+
+
+def hyper_of(config: Config) -> Hyper:
+    """The numbers of a run of a resolved configuration."""
+    learner, facmac, race = config.learner, config.facmac, config.race
+    unused = float("nan")
+    numbers = {
+        "target_update_rate": unused if config.discrete else learner.target_update_rate,
+        "smoothing_noise": learner.smoothing_noise if config.base == "matd3" else unused,
+        "smoothing_clip": learner.smoothing_clip if config.base == "matd3" else unused,
+        "td_lambda": facmac.td_lambda if config.discrete else unused,
+    }
+    shared: Any = facmac if config.discrete else learner
+    for name in ("actor_learning_rate", "critic_learning_rate", "gradient_clip", "discount"):
+        numbers[name] = getattr(shared, name)
+    of_population = (
+        "mutation_fraction",
+        "mutation_probability",
+        "agent_mutation_probability",
+        "vmm_weight",
+    )
+    for name in of_population:
+        numbers[name] = getattr(race, name) if config.has_population else unused
+    return Hyper(**{name: np.float32(number) for name, number in numbers.items()})

@@ -1,0 +1,152 @@
+"""How a run's state gets to disk and back; `race.training.trainer` alone decides when."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from race import ALGORITHM_VERSION, programs
+from race.algorithms import Algorithm
+from race.config.hyper import hyper_of
+from race.config.settings import Config
+from race.errors import CheckpointError, DivergenceError
+from race.networks.optimization import copy
+from race.programs import empty_losses, start
+from race.randomness import Purpose, root_key
+from race.replay.buffer import Replay
+from race.runs import checkpoints
+from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
+from race.runs.trees import flatten, restore
+from race.training.run import Run, stamped
+from race.training.run_state import Progress, RunState, statics
+from race.types import Spec
+
+SEGMENT_BYTES = 2**26
+
+
+def save(run: Run, state: RunState) -> None:
+    """Writes a checkpoint.
+
+    Raises:
+        DivergenceError: if a number of the algorithm's state is not finite.
+        CheckpointError: if it cannot be written.
+    """
+    if not programs.all_finite(state.algorithm):
+        raise DivergenceError(
+            "A network's parameters are no longer finite numbers, though its last loss was. Start "
+            "a new run with smaller learning rates (--learner.actor-learning-rate, "
+            "--learner.critic-learning-rate, or of --facmac)."
+        )
+    run.metrics.sync()
+    progress = stamped(run, state.progress).but(metrics_offset=run.metrics.offset)
+    run.report("saving", progress, {})
+    checkpoints.save(
+        run.directory.checkpoints,
+        f"step-{progress.env_steps:012d}",
+        *_contents(state, progress),
+        run.config.checkpoint.keep,
+        _segment_rows(state.replay),
+    )
+
+
+def _contents(
+    state: RunState, progress: Progress
+) -> tuple[dict[str, Any], dict[str, Any], dict[str, Rows]]:
+    """What `race.runs.checkpoints.save` takes: arrays, info, rows."""
+    replay = state.replay
+    columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
+    rows = Rows(columns, int(replay.inserted), replay.capacity)
+    arrays = flatten({"algorithm": state.algorithm, "losses": state.losses})
+    info = {"progress": dataclasses.asdict(progress), "algorithm_version": ALGORITHM_VERSION}
+    return arrays, info, {"replay": rows}
+
+
+def _segment_rows(replay: Replay) -> int:
+    """Items of a file of a checkpoint: of transitions many, of episodes about 64 MB."""
+    item = sum(leaf.nbytes // leaf.shape[0] for leaf in jax.tree.leaves(replay.data))
+    return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // item))
+
+
+def from_checkpoint(
+    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm, replay: Replay
+) -> RunState:
+    """The state that a checkpoint holds; ``replay`` has the shapes of the run's buffer.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task, or by a
+            version whose numbers differ from this one's.
+    """
+    began_with = saved.info.get("algorithm_version", 1)
+    if began_with != ALGORITHM_VERSION:
+        raise CheckpointError(
+            f"The run was begun by another version of race, whose algorithm ({began_with}) gives "
+            f"other numbers than this one's ({ALGORITHM_VERSION}), so it cannot go on here. Go on "
+            "with the version named in metadata.json, or begin a new run; evaluate, render and "
+            "plot read this one as it is."
+        )
+    progress = progress_of(saved)
+    trained = learned_of(saved, config, spec, algorithm)
+    filled = _filled(saved, replay)
+    return RunState(trained["algorithm"], trained["losses"], filled, progress, hyper_of(config))
+
+
+def learned_of(
+    saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm
+) -> dict[str, Any]:
+    """The algorithm's state and the loss sums that a checkpoint holds.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+    key = root_key(config.seed, Purpose.INIT)
+    template = {
+        "algorithm": start(key, **statics(config, spec, algorithm)),
+        "losses": empty_losses(algorithm),
+    }
+    # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
+    return copy(restore(template, saved.arrays))
+
+
+def progress_of(saved: Checkpoint) -> Progress:
+    """The progress that a checkpoint holds.
+
+    Raises:
+        CheckpointError: if it holds none that this version understands.
+    """
+    values = saved.info.get("progress")
+    names = {f.name for f in dataclasses.fields(Progress)}
+    if not isinstance(values, dict) or set(values) != names:
+        raise CheckpointError(
+            f"The checkpoint {saved.path} was not written by this version of race: its record of "
+            "the run's progress differs. Use the version named in metadata.json."
+        )
+    return Progress(**{**values, "fitness": tuple(values["fitness"])})
+
+
+def _filled(saved: Checkpoint, replay: Replay) -> Replay:
+    """The buffer with what the checkpoint holds."""
+    if "replay" not in saved.rows:
+        raise CheckpointError(f"The checkpoint {saved.path} holds no replay buffer.")
+    rows, capacity = saved.rows["replay"], replay.capacity
+    if rows.size > capacity or rows.inserted > rows.capacity != capacity:
+        raise CheckpointError(
+            f"The checkpoint {saved.path} holds a replay buffer of {rows.capacity} items, "
+            f"which does not go into the {capacity} that config.json asks for. Put "
+            "replay_capacity back to what the run began with."
+        )
+    columns = {}
+    for name, column in replay.data._asdict().items():
+        kept = rows.columns.get(name)
+        if kept is None or kept.shape[1:] != column.shape[1:] or kept.dtype != column.dtype:
+            raise CheckpointError(
+                f"The checkpoint {saved.path} holds experience of another task: its replay "
+                f"column {name} does not fit. Is config.json the one that the run began with?"
+            )
+        if rows.capacity != capacity:
+            larger = np.zeros(column.shape, column.dtype)
+            larger[: rows.size] = kept[: rows.size]
+            kept = larger
+        columns[name] = jnp.array(kept)
+    return Replay(replay.data._replace(**columns), jnp.asarray(rows.inserted, jnp.int32))

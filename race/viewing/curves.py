@@ -1,0 +1,167 @@
+"""Learning curves: which quantity of which runs, and what several seeds become."""
+
+import difflib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from race.config.settings import Config
+from race.errors import RaceError
+from race.runs.recorded import Recorded, settings
+from race.statistics.intervals import mean_interval
+
+TEAMS = ("selected", "marl", "champion")
+LABELS = {
+    "selected": "selected team",
+    "marl": "MARL team",
+    "champion": "champion",
+    "best": "best of two tests",
+}
+Axis = Literal["env_steps", "wall_time"]
+_KEY_OF_AXIS = {"env_steps": "env_steps", "wall_time": "wall_seconds"}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One quantity of one run over environment steps, or over seconds."""
+
+    x: NDArray[np.float64]
+    values: NDArray[np.float64]
+    seed: int = 1
+    name: str = ""
+    """Of the run."""
+
+
+class Band(NamedTuple):
+    """The mean over seeds and its 95% interval (Student's t), on a common grid.
+
+    Runs need not be equally long: at each point the seeds count that reach it.
+    """
+
+    x: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    low: NDArray[np.float64]  # NaN with one seed
+    high: NDArray[np.float64]
+    seeds: NDArray[np.int64]
+
+
+def aggregate(curves: Sequence[Curve], bounds: tuple[float, float] = (-math.inf, math.inf)) -> Band:
+    """The mean of several runs with a 95% interval of the mean.
+
+    Runs are evaluated at different steps; each is interpolated linearly onto all steps at which
+    any of them was evaluated, as far as it was itself.
+    """
+    grid = np.unique(np.concatenate([curve.x for curve in curves]))
+    values = np.stack(
+        [np.interp(grid, c.x, c.values, left=math.nan, right=math.nan) for c in curves]
+    )
+    reached = ~np.isnan(values)
+    seeds = reached.sum(axis=0)
+    mean, low, high = (np.full(grid.shape, math.nan) for _ in range(3))
+    # Few patterns of who reaches a point: runs end, but do not begin again.
+    for pattern in np.unique(reached, axis=1).T:
+        at = (reached == pattern[:, None]).all(axis=0)
+        if pattern.any():
+            mean[at], low[at], high[at] = mean_interval(values[np.ix_(pattern, at)], bounds)
+    some = seeds > 0
+    return Band(grid[some], mean[some], low[some], high[some], seeds[some])
+
+
+def ends(curves: Sequence[Curve]) -> list[Curve]:
+    """The runs that end well before the longest of them."""
+    last = max(float(curve.x[-1]) for curve in curves)
+    return [curve for curve in curves if curve.x[-1] < 0.95 * last]
+
+
+def keys(metric: str, team: str, config: Config) -> dict[str, str]:
+    """Keys of the rows to draw, by the label that tells a method's curves apart."""
+    if "/" in metric or metric in ("wall_seconds", "gradient_steps"):
+        return {"": metric}
+    if team == "all" and config.has_population:
+        return {LABELS[name]: f"eval/{name}/{metric}" for name in TEAMS}
+    # Without a population there is the MARL team alone, whatever the choice.
+    name = team if config.has_population and team != "all" else "marl"
+    return {"" if team in ("selected", "all") else LABELS[name]: f"eval/{name}/{metric}"}
+
+
+def names_of(runs: Sequence[Recorded]) -> list[str]:
+    """Each run's method, with the settings in which runs of one method and task differ."""
+
+    def all_of(run: Recorded) -> dict[str, Any]:
+        return {**settings(run.config), "algorithm version": run.algorithm_version}
+
+    every = [all_of(run) for run in runs]
+    of_method: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for run, mine in zip(runs, every, strict=True):
+        of_method.setdefault((run.config.task, run.config.method), []).append(mine)
+    differing = {
+        key: [name for name in rivals[0] if any(r[name] != rivals[0][name] for r in rivals)]
+        for key, rivals in of_method.items()
+    }
+    names = []
+    for run, mine in zip(runs, every, strict=True):
+        parts = [f"{key}={mine[key]}" for key in differing[run.config.task, run.config.method]]
+        names.append(" ".join([run.config.method, ", ".join(parts)]).strip())
+    return names
+
+
+def refuse_twins(runs: Sequence[Recorded]) -> None:
+    """Refuses to count one seed twice.
+
+    Raises:
+        RaceError: naming two runs of one experiment and one seed.
+    """
+    seen: dict[tuple[int, str], str] = {}
+    for run in runs:
+        twin = seen.setdefault((run.config.seed, run.experiment), run.name)
+        if twin != run.name:
+            raise RaceError(
+                f"{twin} and {run.name} are the same experiment with the same seed "
+                f"{run.config.seed}; counted as two seeds they would make the interval too narrow. "
+                "Name one of them."
+            )
+
+
+def curve_of(run: Recorded, key: str, axis: Axis) -> Curve | None:
+    """The values of a key, or None where the run has none."""
+    over = _KEY_OF_AXIS[axis]
+    points = [
+        (float(row[over]), float(row[key]))
+        for row in run.rows
+        if _is_number(row.get(key)) and _is_number(row.get(over))
+    ]
+    if not points:
+        return None
+    x, values = np.array(points).T
+    return Curve(x, values, run.config.seed, run.name)
+
+
+def no_values(runs: Sequence[Recorded], metric: str) -> RaceError:
+    """What to say where no run has a value of the metric."""
+    known = {k for run in runs for row in run.rows for k, v in row.items() if _is_number(v)}
+    which = runs[0].name if len(runs) == 1 else f"any of {len(runs)} runs"
+    if not known:
+        return RaceError(
+            f"There are no rows of metrics in {which} yet: wait until the first generation is over."
+        )
+    wanted = metric in ("return_mean", "return_std", "length_mean", "win_rate")
+    if wanted and not any(key.startswith("eval/") for key in known):
+        return RaceError(
+            f"There has not been an evaluation in {which} yet. Wait for the first, or draw a "
+            "training quantity such as --metric marl/return."
+        )
+    short = {key.removeprefix("eval/selected/") for key in known}
+    near = difflib.get_close_matches(metric, sorted(known | short), n=3, cutoff=0.3)
+    return RaceError(
+        f"There are no values of {metric!r} in {which}. "
+        + (f"Nearest: {', '.join(near)}. " if near else "")
+        + f"All: {', '.join(sorted(known))}."
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
