@@ -166,7 +166,7 @@ def one_step(config: Config, spec: EnvSpec) -> tuple[Any, Any]:
 def test_numbers_as_arguments_give_what_they_give_as_constants(
     algo: str, base: Any, tiny_spec: EnvSpec, batch_of: Callable[..., Any]
 ) -> None:
-    config = dataclasses.replace(continuous(algo, race=OTHER_RACE, **OTHER_LEARNER))
+    config = continuous(algo, race=OTHER_RACE, **OTHER_LEARNER)
     if base == "facmac":
         config = resolve(dataclasses.replace(config, base=base))
     state, update = one_step(config, tiny_spec)

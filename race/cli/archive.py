@@ -20,6 +20,8 @@ class Archive:
     """Run directories, folders that hold some, or archives to join."""
     out: Path = Path("results.jsonl.gz")
     """The file; its name ends with .jsonl.gz."""
+    force: bool = False
+    """Replace a file that is there, though it is none of those that are joined."""
 
 
 def main(arguments: list[str]) -> None:
@@ -27,22 +29,22 @@ def main(arguments: list[str]) -> None:
     chosen = tyro.cli(Archive, args=arguments, prog="race archive")
     from race.errors import RunDirectoryError
     from race.runs import archive
-    from race.runs.recorded import load
+    from race.runs.results import load
     from race.viewing.curves import refuse_twins
 
     if not chosen.runs:
         raise RunDirectoryError(
             "Say which runs to keep: race archive DIR [DIR ...] --out results.jsonl.gz"
         )
+    joined = {path.resolve() for path in chosen.runs}
+    if chosen.out.exists() and chosen.out.resolve() not in joined and not chosen.force:
+        raise RunDirectoryError(
+            f"{chosen.out} is there already. Name it among the runs to add to it, choose another "
+            "--out, or replace it with --force."
+        )
     runs = load(chosen.runs)
     refuse_twins(runs)
-    archive.write(
-        chosen.out,
-        [
-            (archive.Kept(run.name, run.config, run.rows, run.metadata), run.experiment)
-            for run in runs
-        ],
-    )
+    archive.write(chosen.out, runs)
     experiments = len({run.experiment for run in runs})
     print(
         f"{chosen.out}: {len(runs)} run{'s' * (len(runs) != 1)} of {experiments} "

@@ -51,7 +51,7 @@ def main(arguments: list[str]) -> None:
         seeds = f"{row.seeds} seed{'s' if row.seeds > 1 else ''}"
         print(
             f"{row.task}, {row.curve}: {chosen.metric} {rounded(row.mean)}"
-            f"{'' if math.isnan(row.low) else interval} at {place(row.env_steps)} ({seeds})"
+            f"{'' if math.isnan(row.low) else interval} at {place(row.x)} ({seeds})"
         )
         for run in row.ended_early:
             print(f"  seed {run.seed} ends at {place(run.x[-1])} ({run.name})")

@@ -23,7 +23,8 @@ class Resume:
     env_steps: int | None = None
     """Train up to this many environment steps instead of what the run began with."""
     jobs: int | None = None
-    """If DIR holds the runs of several seeds: so many at a time. None: as many as cores."""
+    """If DIR holds the runs of several seeds: so many at a time. None: as many as cores, or one on
+    an accelerator."""
 
 
 def main(arguments: list[str]) -> None:

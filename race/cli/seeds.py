@@ -4,6 +4,8 @@ The directories are made here; every process is then `race resume` of one of the
 start and a later one are the same thing.
 """
 
+import dataclasses
+import json
 import os
 import signal
 import subprocess
@@ -19,10 +21,10 @@ from rich.live import Live
 from rich.table import Table
 
 from race.cli.progress import duration, test_summary
+from race.config.presets import resolve
 from race.config.settings import Config
 from race.errors import ConfigError, RunDirectoryError
 from race.runs import directory as run_directory
-from race.runs import metrics
 from race.runs.directory import RunDirectory
 
 LOOK_EVERY = 0.5
@@ -33,6 +35,8 @@ _SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
+# JAX would give the first process three quarters of an accelerator's memory.
+SHARED_ACCELERATOR = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"}
 
 
 def parse_seeds(text: str) -> list[int]:
@@ -75,13 +79,12 @@ class Worker:
         self.ended: str | None = "finished" if run_directory.is_finished(path) else None
         self.row: dict[str, Any] = {}
         self.test: dict[str, Any] = {}
-        self._read_to = 0
+        self._read_to = 0  # bytes of the metrics
 
-    def start(self, core: int | None, env_steps: int | None) -> None:
+    def start(self, core: int | None) -> None:
         """Goes on with the run, on one core if one is named."""
-        extend = [] if env_steps is None else ["--env-steps", str(env_steps)]
-        command = [sys.executable, "-m", "race", "resume", str(self.path), *extend]
-        environment = os.environ | ({} if core is None else _SINGLE_THREADED)
+        command = [sys.executable, "-m", "race", "resume", str(self.path)]
+        environment = os.environ | SHARED_ACCELERATOR | ({} if core is None else _SINGLE_THREADED)
         with (self.path / "log.txt").open("ab") as log:
             # A session of its own: Ctrl-C reaches this process, which passes it on once.
             self.process = subprocess.Popen(
@@ -93,17 +96,34 @@ class Worker:
 
     def look(self) -> list[dict[str, Any]]:
         """Reads what the run has written since the last look; returns its new evaluations."""
-        file = RunDirectory(self.path).metrics
-        rows = metrics.read(file) if file.exists() else []
-        new = rows[self._read_to :] if len(rows) >= self._read_to else []
-        self._read_to = len(rows)
-        evaluations = [row for row in new if row["kind"] == "evaluation"]
-        self.row = rows[-1] if rows else self.row
+        code = None if self.process is None else self.process.poll()
+        new = self._new_rows()
+        evaluations = [row for row in new if row.get("kind") == "evaluation"]
+        self.row = new[-1] if new else self.row
         self.test = evaluations[-1] if evaluations else self.test
-        if self.process is not None and (code := self.process.poll()) is not None:
+        if code is not None:
             self.process = None
             self.ended = {0: "finished", _INTERRUPTED: "interrupted"}.get(code, "failed")
         return evaluations
+
+    def _new_rows(self) -> list[dict[str, Any]]:
+        file = RunDirectory(self.path).metrics
+        size = file.stat().st_size if file.exists() else 0
+        if size <= self._read_to:
+            # Shorter: the run was resumed and drops the rows written after its checkpoint.
+            self._read_to = size
+            return []
+        with file.open("rb") as lines:
+            lines.seek(self._read_to)
+            whole = lines.read().rpartition(b"\n")[0]
+        self._read_to += len(whole) + bool(whole)
+        found = []
+        for line in whole.splitlines():
+            try:  # a damaged line is for the run itself to complain of
+                found.append(json.loads(line))
+            except ValueError:
+                continue
+        return [row for row in found if isinstance(row, dict) and "env_steps" in row]
 
     @property
     def stage(self) -> str:
@@ -118,7 +138,7 @@ class Worker:
 
 @final
 class _Signals:
-    """The first SIGINT or SIGTERM asks the runs to save and stop; a second ends them at once."""
+    """The first SIGINT, SIGTERM or SIGHUP asks the runs to save and stop; a second ends them."""
 
     def __init__(self, workers: Sequence[Worker]) -> None:
         self.requested = False
@@ -126,7 +146,7 @@ class _Signals:
         self._previous: dict[int, Any] = {}
 
     def __enter__(self) -> "_Signals":
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             self._previous[number] = signal.signal(number, self._pass_on)
         return self
 
@@ -145,8 +165,12 @@ class _Signals:
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         for worker in self._workers:
-            if worker.process is not None:
-                worker.process.send_signal(signal.SIGINT)
+            self.stop(worker)
+
+    def stop(self, worker: Worker) -> None:
+        """Asks one run to save and stop."""
+        if worker.process is not None:
+            worker.process.send_signal(signal.SIGINT)
 
 
 def run_all(
@@ -156,8 +180,8 @@ def run_all(
 
     Args:
         path: the folder that holds them.
-        jobs: runs at a time; None: as many as cores. Each has a core of its own where there are
-            enough.
+        jobs: runs at a time, each kept on one core if there are several; None: as many as cores,
+            or one on an accelerator.
         env_steps: a new budget for all.
         console: where it is shown.
 
@@ -165,14 +189,15 @@ def run_all(
         RunDirectoryError: if a run failed; the others are trained to their end first.
     """
     console = console or Console()
+    if env_steps is not None:
+        _extend(path, env_steps)
     workers = [Worker(run, run_directory.open_run(run)) for run in directories_of(path)]
     for worker in workers:
-        if env_steps is not None:
-            worker.ended = None
         worker.look()
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    jobs = min(jobs or max(len(cores), 1), len(workers))
-    free: list[int | None] = [*cores[:jobs]] if 1 < jobs <= len(cores) else [None] * jobs
+    jobs = min(jobs or _usual_jobs(cores), len(workers))
+    pinned = jobs > 1 and cores
+    free: list[int | None] = [cores[k % len(cores)] if pinned else None for k in range(jobs)]
     with (
         _Signals(workers) as signals,
         Live(console=console, refresh_per_second=2, transient=True) as live,
@@ -180,20 +205,54 @@ def run_all(
         while True:
             waiting = [w for w in workers if w.ended is None and w.process is None]
             if waiting and free and not signals.requested:
-                waiting[0].start(free.pop(0), env_steps)
+                waiting[0].start(free.pop(0))
+                if signals.requested:  # between the start and the noting of it
+                    signals.stop(waiting[0])
                 continue
-            for worker in workers:
-                busy = worker.process is not None
+            for worker in [worker for worker in workers if worker.process is not None]:
                 for row in worker.look():
                     console.print(_line(worker, row), highlight=False, soft_wrap=True)
-                if busy and worker.process is None:
+                if worker.process is None:
+                    if signals.requested and worker.ended == "failed":
+                        # Stopped before it could listen; nothing is lost.
+                        worker.ended = "interrupted"
                     free.append(worker.core)
                     console.print(f"seed {worker.config.seed}: {worker.stage}", highlight=False)
-            live.update(_table(workers, env_steps))
+            live.update(_table(workers))
             if not any(w.process for w in workers) and (signals.requested or not waiting):
                 break
             time.sleep(LOOK_EVERY)
     _say_how_it_ended(path, workers, console)
+
+
+def _usual_jobs(cores: Sequence[int]) -> int:
+    import jax
+
+    return max(len(cores), 1) if jax.default_backend() == "cpu" else 1
+
+
+def _extend(path: Path, env_steps: int) -> None:
+    """Gives every run a new budget before any goes on, so that a stop in between forgets none.
+
+    Raises:
+        ConfigError: if no run is short of it.
+    """
+    short = []
+    for place in directories_of(path):
+        worker = Worker(place, run_directory.open_run(place))
+        worker.look()
+        made = worker.row.get("env_steps", 0)
+        if not (worker.ended and made >= env_steps):
+            short.append((place, resolve(dataclasses.replace(worker.config, env_steps=env_steps))))
+    if not short:
+        raise ConfigError(
+            f"All runs in {path} have made {env_steps:,} environment steps or more, so --env-steps "
+            f"{env_steps} would not extend them. Ask for more."
+        )
+    for place, config in short:
+        with run_directory.lock(place):
+            run_directory.clear_finished(place)
+            run_directory.change_config(place, config)
 
 
 def _say_how_it_ended(path: Path, workers: Sequence[Worker], console: Console) -> None:
@@ -217,10 +276,10 @@ def _line(worker: Worker, row: dict[str, Any]) -> str:
     )
 
 
-def _table(workers: Sequence[Worker], env_steps: int | None) -> Table:
+def _table(workers: Sequence[Worker]) -> Table:
     table = Table("seed", "state", "steps", "time", "test return", box=None, pad_edge=False)
     for worker in workers:
-        steps, total = worker.row.get("env_steps", 0), env_steps or worker.config.env_steps
+        steps, total = worker.row.get("env_steps", 0), worker.config.env_steps
         table.add_row(
             str(worker.config.seed),
             worker.stage,

@@ -1,6 +1,7 @@
 """``race train``."""
 
 import dataclasses
+import os
 from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -47,7 +48,8 @@ class Train:
     """Several seeds instead, such as 1-5 or 1,4,7: a run each, in RUN_DIR/seedN, at once as far as
     there are cores. `race resume RUN_DIR` goes on with all of them."""
     jobs: int | None = None
-    """With --seeds: runs at a time, each on a core of its own. None: as many as cores."""
+    """With --seeds: runs at a time, each kept on one core. None: as many as cores, or one on an
+    accelerator."""
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
     run_dir: Path | None = None
@@ -74,11 +76,13 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
-    from race.cli.seeds import run_all
+    from race.cli.seeds import SHARED_ACCELERATOR, run_all
     from race.cli.training import describe, run
     from race.envs import make_task
     from race.runs import directory as run_directory
 
+    if chosen.seeds is not None:  # this process only watches
+        os.environ.update(SHARED_ACCELERATOR)
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)
     _refuse_without_effect(asked, chosen.preset, discrete)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int, UInt32
 
 from race.algorithms.base import Teams
+from race.programs import TRACES
 from race.rollouts.choosing import Exploration, blank, choose
 from race.rollouts.episodes import Played, no_episodes
 from race.types import DeviceEnv, DiscreteSpec, Episode, Observation, Outcome
@@ -65,6 +66,7 @@ def _play(
     spec: DiscreteSpec,
     dtype: str,
 ) -> Played:
+    TRACES["play"] += 1
     key, first = _split(jax.vmap(jax.random.key)(seeds))
     env_state, seen = jax.vmap(reset, in_axes=(None, 0))(arrays, first)
     n_teams = teams.heads.shape[0]

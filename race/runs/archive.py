@@ -9,14 +9,15 @@ what counts or holds for the whole run so far is the last. Numbers that are not 
 
 import gzip
 import json
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from race.config import settings as configs
 from race.config.presets import resolve
-from race.config.settings import Config
 from race.errors import ConfigError, RunDirectoryError
+from race.runs.recorded import Recorded
 
 SUFFIX = ".jsonl.gz"
 FORMAT = {"format": "race-archive", "version": 1}
@@ -25,18 +26,13 @@ DIGITS = 6
 
 # Of a generation's row: what is the newest value, not a mean over generations.
 _LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/")
+_DAMAGES = (ValueError, KeyError, TypeError, EOFError, IndexError, StopIteration, zlib.error)
 # Of a run's origin: the versions that may change numbers.
-_ORIGIN = ("race", "algorithm_version", "git", "started", "command", "platform", "processor")
+_ORIGIN = (
+    *("race", "algorithm_version", "git", "started", "command", "python"),
+    *("platform", "processor", "backend", "devices"),
+)
 _LIBRARIES = ("jax", "jaxlib", "numpy", "mujoco", "gymnasium", "gymnasium-robotics", "optax")
-
-
-class Kept(NamedTuple):
-    """A run as an archive holds it."""
-
-    name: str
-    config: Config
-    rows: list[dict[str, Any]]
-    metadata: dict[str, Any]
 
 
 def is_archive(path: Path) -> bool:
@@ -44,7 +40,7 @@ def is_archive(path: Path) -> bool:
     return path.name.endswith(SUFFIX) and not path.is_dir()
 
 
-def write(out: Path, runs: Iterable[tuple[Kept, str]]) -> None:
+def write(out: Path, runs: Iterable[Recorded]) -> None:
     """Writes runs, each with the key of its experiment, to ``out``; replaces what was there.
 
     Raises:
@@ -61,16 +57,16 @@ def write(out: Path, runs: Iterable[tuple[Kept, str]]) -> None:
             gzip.GzipFile(fileobj=raw, mode="wb", mtime=0, filename="") as file,
         ):
             file.write(_line(FORMAT))
-            for run, key in runs:
-                file.write(_line(_packed(run, key)))
+            for run in runs:
+                file.write(_line(_packed(run)))
         temporary.rename(out)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise RunDirectoryError(f"The archive {out} cannot be written: {error}.") from error
 
 
-def read(path: Path) -> list[Kept]:
-    """The runs of an archive.
+def read(path: Path) -> list[Recorded]:
+    """The runs of an archive, named after it and where they lay.
 
     Raises:
         RunDirectoryError: if it cannot be read, or is no archive that this version understands.
@@ -80,10 +76,10 @@ def read(path: Path) -> list[Kept]:
             head, *lines = file.read().splitlines()
         if json.loads(head) != FORMAT:
             raise ValueError(f"its first line is {head[:80]}")
-        return [_unpacked(json.loads(line)) for line in lines]
+        return [_unpacked(path, json.loads(line)) for line in lines]
     except OSError as error:
         raise RunDirectoryError(f"The archive {path} cannot be read: {error}.") from error
-    except (ValueError, KeyError, TypeError, EOFError, ConfigError) as error:
+    except (*_DAMAGES, ConfigError) as error:
         raise RunDirectoryError(
             f"{path} is no archive that this version of race understands ({error}). Make it anew "
             f"from its runs: race archive DIR... --out {path.name}"
@@ -113,7 +109,7 @@ def _one_of(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return one
 
 
-def _packed(run: Kept, key: str) -> dict[str, Any]:
+def _packed(run: Recorded) -> dict[str, Any]:
     rows = thinned(run.rows)
     tables = {}
     for kind in sorted({str(row.get("kind")) for row in rows}):
@@ -125,8 +121,8 @@ def _packed(run: Kept, key: str) -> dict[str, Any]:
     versions = run.metadata.get("versions", {})
     origin["versions"] = {name: versions[name] for name in _LIBRARIES if name in versions}
     return {
-        "run": run.name,
-        "experiment": key,
+        "run": run.name.rpartition(":")[2],
+        "experiment": run.experiment,
         "config": configs.to_json(run.config),
         "metadata": origin,
         "order": "".join(str(row.get("kind"))[:1] for row in rows),
@@ -134,13 +130,13 @@ def _packed(run: Kept, key: str) -> dict[str, Any]:
     }
 
 
-def _unpacked(packed: dict[str, Any]) -> Kept:
+def _unpacked(path: Path, packed: dict[str, Any]) -> Recorded:
     tables = packed["rows"]
     rest = {kind: iter(_rows_of(kind, columns)) for kind, columns in tables.items()}
     kinds = {kind[:1]: kind for kind in tables}
     rows = [next(rest[kinds[letter]]) for letter in packed["order"]]
     config = resolve(configs.from_json(packed["config"]))
-    return Kept(str(packed["run"]), config, rows, dict(packed["metadata"]))
+    return Recorded(f"{path}:{packed['run']}", config, rows, dict(packed["metadata"]))
 
 
 def _rows_of(kind: str, columns: dict[str, list[Any]]) -> list[dict[str, Any]]:

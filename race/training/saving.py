@@ -69,6 +69,21 @@ def _segment_rows(replay: Replay) -> int:
     return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // item))
 
 
+def check_version(began_with: Any) -> None:
+    """Refuses to go on with a run of another version of the algorithm; None: it is not known.
+
+    Raises:
+        CheckpointError: naming both versions.
+    """
+    if began_with not in (None, ALGORITHM_VERSION):
+        raise CheckpointError(
+            f"The run was begun by another version of race, whose algorithm ({began_with}) gives "
+            f"other numbers than this one's ({ALGORITHM_VERSION}), so it cannot go on here. Go on "
+            "with the version named in metadata.json, or begin a new run; evaluate, render and "
+            "plot read this one as it is."
+        )
+
+
 def from_checkpoint(
     saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm, replay: Replay
 ) -> RunState:
@@ -78,14 +93,7 @@ def from_checkpoint(
         CheckpointError: if it was written by a run with other networks or another task, or by a
             version whose numbers differ from this one's.
     """
-    began_with = saved.info.get("algorithm_version", 1)
-    if began_with != ALGORITHM_VERSION:
-        raise CheckpointError(
-            f"The run was begun by another version of race, whose algorithm ({began_with}) gives "
-            f"other numbers than this one's ({ALGORITHM_VERSION}), so it cannot go on here. Go on "
-            "with the version named in metadata.json, or begin a new run; evaluate, render and "
-            "plot read this one as it is."
-        )
+    check_version(saved.info.get("algorithm_version", 1))
     progress = progress_of(saved)
     trained = learned_of(saved, config, spec, algorithm)
     filled = _filled(saved, replay)

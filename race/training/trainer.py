@@ -25,7 +25,7 @@ from race.training.generation import advance, warm_up
 from race.training.interrupts import Interrupts
 from race.training.run import Report, Run, silent
 from race.training.run_state import Progress, RunState, fresh
-from race.training.saving import from_checkpoint, progress_of, save
+from race.training.saving import check_version, from_checkpoint, progress_of, save
 
 
 def train(
@@ -64,6 +64,8 @@ def train(
             return made
         rollouts = rollouts_of(config, task)
         if saved is None:
+            origin = run_directory.read_metadata(path)
+            check_version(origin.get("algorithm_version", 1) if origin else None)
             state = fresh(config, task.spec, algorithm, rollouts.empty_replay())
         else:
             # An empty buffer beside the full one would take as much memory again.

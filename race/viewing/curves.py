@@ -25,56 +25,61 @@ Axis = Literal["env_steps", "wall_time"]
 _KEY_OF_AXIS = {"env_steps": "env_steps", "wall_time": "wall_seconds"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Curve:
     """One quantity of one run over environment steps, or over seconds."""
 
     x: NDArray[np.float64]
     values: NDArray[np.float64]
+    env_steps: float
+    """How far the run came."""
     seed: int = 1
     name: str = ""
     """Of the run."""
 
 
 class Band(NamedTuple):
-    """The mean over seeds and its 95% interval (Student's t), on a common grid.
-
-    Runs need not be equally long: at each point the seeds count that reach it.
-    """
+    """The mean over seeds and its 95% interval (Student's t), on a common grid."""
 
     x: NDArray[np.float64]
     mean: NDArray[np.float64]
     low: NDArray[np.float64]  # NaN with one seed
     high: NDArray[np.float64]
     seeds: NDArray[np.int64]
+    """How many there are at each point: all, but where runs had ended early."""
 
 
 def aggregate(curves: Sequence[Curve], bounds: tuple[float, float] = (-math.inf, math.inf)) -> Band:
     """The mean of several runs with a 95% interval of the mean.
 
     Runs are evaluated at different steps; each is interpolated linearly onto all steps at which
-    any of them was evaluated, as far as it was itself.
+    any of them was evaluated. The grid is what all runs that came to the end have in common; those
+    that ended early (`ended_early`) count as far as they came.
     """
+    early = ended_early(curves)
+    whole = [curve for curve in curves if curve not in early]
+    first = max(float(curve.x[0]) for curve in whole)
+    last = min(float(curve.x[-1]) for curve in whole)
     grid = np.unique(np.concatenate([curve.x for curve in curves]))
+    if first <= last:  # else each is drawn where it is
+        grid = grid[(grid >= first) & (grid <= last)]
     values = np.stack(
         [np.interp(grid, c.x, c.values, left=math.nan, right=math.nan) for c in curves]
     )
     reached = ~np.isnan(values)
-    seeds = reached.sum(axis=0)
     mean, low, high = (np.full(grid.shape, math.nan) for _ in range(3))
     # Few patterns of who reaches a point: runs end, but do not begin again.
     for pattern in np.unique(reached, axis=1).T:
         at = (reached == pattern[:, None]).all(axis=0)
         if pattern.any():
             mean[at], low[at], high[at] = mean_interval(values[np.ix_(pattern, at)], bounds)
-    some = seeds > 0
-    return Band(grid[some], mean[some], low[some], high[some], seeds[some])
+    return Band(grid, mean, low, high, reached.sum(axis=0))
 
 
-def ends(curves: Sequence[Curve]) -> list[Curve]:
-    """The runs that end well before the longest of them."""
-    last = max(float(curve.x[-1]) for curve in curves)
-    return [curve for curve in curves if curve.x[-1] < 0.95 * last]
+def ended_early(curves: Sequence[Curve]) -> list[Curve]:
+    """The runs that made well fewer environment steps than the longest of them."""
+    longest = max(curve.env_steps for curve in curves)
+    return [curve for curve in curves if curve.env_steps < 0.95 * longest]
 
 
 def keys(metric: str, team: str, config: Config) -> dict[str, str]:
@@ -110,20 +115,21 @@ def names_of(runs: Sequence[Recorded]) -> list[str]:
 
 
 def refuse_twins(runs: Sequence[Recorded]) -> None:
-    """Refuses to count one seed twice.
+    """Refuses to count one seed twice, be it in a directory and again in an archive.
 
     Raises:
         RaceError: naming two runs of one experiment and one seed.
     """
     seen: dict[tuple[int, str], str] = {}
     for run in runs:
-        twin = seen.setdefault((run.config.seed, run.experiment), run.name)
-        if twin != run.name:
+        key = run.config.seed, run.experiment
+        if key in seen:
             raise RaceError(
-                f"{twin} and {run.name} are the same experiment with the same seed "
+                f"{seen[key]} and {run.name} are the same experiment with the same seed "
                 f"{run.config.seed}; counted as two seeds they would make the interval too narrow. "
                 "Name one of them."
             )
+        seen[key] = run.name
 
 
 def curve_of(run: Recorded, key: str, axis: Axis) -> Curve | None:
@@ -137,7 +143,8 @@ def curve_of(run: Recorded, key: str, axis: Axis) -> Curve | None:
     if not points:
         return None
     x, values = np.array(points).T
-    return Curve(x, values, run.config.seed, run.name)
+    made = max(float(row.get("env_steps", 0)) for row in run.rows)
+    return Curve(x, values, made, run.config.seed, run.name)
 
 
 def no_values(runs: Sequence[Recorded], metric: str) -> RaceError:

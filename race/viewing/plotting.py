@@ -11,10 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from race.errors import RaceError
-from race.runs.recorded import Recorded, load
+from race.runs.recorded import Recorded
+from race.runs.results import load
 from race.statistics.intervals import LEAST_SEEDS_OF_A_BAND, bounds_of
 from race.viewing import curves as chosen
-from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ends
+from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ended_early
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -42,8 +43,8 @@ class Summary(NamedTuple):
     curve: str
     seeds: int
     """At the last point."""
-    env_steps: int
-    """Of the last point; with time on the axis, seconds."""
+    x: float
+    """Environment steps of the last point; with time on the axis, seconds."""
     mean: float
     low: float  # of the 95% interval; NaN with one seed
     high: float
@@ -92,7 +93,7 @@ def plot(
     found = []
     for index, (task, methods) in enumerate(sorted(panels.items())):
         axes = figure.add_subplot(rows, columns, index + 1)
-        found += _panel(axes, task, methods, metric, axis)
+        found += _panel(axes, task, methods, metric, axis, with_seeds=team != "all")
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(out, dpi=150)
@@ -120,25 +121,26 @@ def _panels(
     return panels, without
 
 
-def _panel(axes: Axes, task: str, methods: Methods, metric: str, axis: Axis) -> list[Summary]:
+def _panel(
+    axes: Axes, task: str, methods: Methods, metric: str, axis: Axis, *, with_seeds: bool
+) -> list[Summary]:
+    """One task. Seeds or bands of all teams would hide the lines: then there are none."""
     found = []
     colours = _colours(methods)
     for (method, name), runs in sorted(methods.items(), reverse=True):
         band = aggregate(runs, bounds_of(metric))
         label = next((n for n, text in LABELS.items() if name.endswith(text)), "selected")
-        # Seeds and bands of all teams would hide the lines.
-        with_seeds = label in ("selected", "best") or len(methods) <= 2
         _draw(axes, band, runs, colours[method, name], _LINES[label], name, with_seeds)
         found.append(
             Summary(
                 task,
                 name,
                 int(band.seeds[-1]),
-                int(band.x[-1]),
+                float(band.x[-1]),
                 float(band.mean[-1]),
                 float(band.low[-1]),
                 float(band.high[-1]),
-                tuple(ends(runs)),
+                tuple(ended_early(runs)),
             )
         )
     _frame(axes, task, metric, axis)
@@ -165,9 +167,10 @@ def _draw(
     elif with_seeds and len(runs) > 1:
         for run in runs:
             axes.plot(run.x, run.values, color=colour, linestyle=line, linewidth=0.7, alpha=0.5)
-    for run in ends(runs):
-        height = np.interp(run.x[-1], band.x, band.mean)
-        axes.plot(run.x[-1], height, marker="x", color=colour, markersize=7)
+    for run in ended_early(runs):
+        if band.x[0] <= run.x[-1] <= band.x[-1]:
+            height = np.interp(run.x[-1], band.x, band.mean)
+            axes.plot(run.x[-1], height, marker="x", color=colour, markersize=7)
 
 
 def _colours(methods: Methods) -> dict[tuple[str, str], str]:

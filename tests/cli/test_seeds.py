@@ -55,7 +55,9 @@ def test_each_seed_is_the_run_it_is_alone(both: Path, tmp_path: Path) -> None:
     assert command == sys.argv
 
 
-def test_finished_seeds_are_extended_as_a_whole(both: Path, tmp_path: Path) -> None:
+def test_finished_seeds_are_extended_as_a_whole(
+    both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = Path(shutil.copytree(both, tmp_path / "runs"))
     race(f"resume {path} --env-steps 140 --jobs 1")
     for run in directories_of(path):
@@ -64,6 +66,30 @@ def test_finished_seeds_are_extended_as_a_whole(both: Path, tmp_path: Path) -> N
     before = [rows(run) for run in directories_of(path)]
     race(f"resume {path}")  # there is nothing left to do
     assert [rows(run) for run in directories_of(path)] == before
+    assert "would not extend" in fails(f"resume {path} --env-steps 130", capsys)
+
+
+def test_a_new_budget_is_everybodys_before_anybody_goes_on(
+    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped before the second has its turn, a plain resume still knows of it."""
+    path = Path(shutil.copytree(both, tmp_path / "runs"))
+
+    def stop_at_once(self: seeds.Worker, core: int | None) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as stopped:
+        stopped.setattr(seeds.Worker, "start", stop_at_once)
+        with pytest.raises(SystemExit) as ended:
+            race(f"resume {path} --env-steps 140 --jobs 1")
+    assert ended.value.code == 130
+    assert not any(run_directory.is_finished(run) for run in directories_of(path))
+    race(f"resume {path} --jobs 2")
+    assert all(rows(run)[-1]["env_steps"] >= 140 for run in directories_of(path))
+    # One of them longer than the others: asked for less, the others are brought up to it.
+    race(f"resume {path / 'seed1'} --env-steps 180")
+    race(f"resume {path} --env-steps 160")
+    assert [rows(run)[-1]["env_steps"] >= 160 for run in directories_of(path)] == [True, True]
 
 
 def test_bad_input(both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -121,7 +147,7 @@ def test_runs_have_a_core_each_where_there_are_enough(
         def poll(self) -> int:
             return 0
 
-    def start(self: seeds.Worker, core: int | None, env_steps: int | None) -> None:
+    def start(self: seeds.Worker, core: int | None) -> None:
         started.append(core)
         self.core, self.process = core, Process()  # type: ignore[assignment]
 
@@ -131,5 +157,20 @@ def test_runs_have_a_core_each_where_there_are_enough(
     seeds.run_all(path, 2, 500)
     assert started == [3, 5]
     started.clear()
-    seeds.run_all(path, 1, 500)  # alone, a run may use them all
+    seeds.run_all(path, 1, 600)  # alone, a run may use them all
     assert started == [None, None]
+
+
+def test_more_jobs_than_cores_share_them(
+    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[int | None] = []
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})
+    monkeypatch.setattr(
+        seeds.Worker,
+        "start",
+        lambda self, core: (started.append(core), setattr(self, "ended", "finished")),
+    )
+    path = Path(shutil.copytree(both, tmp_path / "runs"))
+    seeds.run_all(path, 2, 500)
+    assert started == [3, 3]

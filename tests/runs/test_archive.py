@@ -12,11 +12,12 @@ import pytest
 from race import ALGORITHM_VERSION
 from race.config import settings as configs
 from race.config.presets import resolve
-from race.config.settings import Config, LearnerConfig, RaceConfig
-from race.errors import RunDirectoryError
+from race.config.settings import Config, FacmacConfig, LearnerConfig, RaceConfig
+from race.errors import RaceError, RunDirectoryError
 from race.runs import archive
 from race.runs import directory as run_directory
-from race.runs.recorded import Recorded, experiment_key, load
+from race.runs.recorded import Recorded, experiment_key
+from race.runs.results import load
 from race.viewing.plotting import plot
 
 TASK = "mamujoco/Hopper-3x1"
@@ -51,8 +52,7 @@ def make_run(path: Path, evaluations: int = 3, **changes: Any) -> Path:
 
 
 def archived(out: Path, *paths: Path) -> list[Recorded]:
-    runs = load(paths)
-    archive.write(out, [(archive.Kept(r.name, *r[1:]), r.experiment) for r in runs])
+    archive.write(out, load(paths))
     return load([out])
 
 
@@ -107,6 +107,36 @@ def test_archives_are_read_like_directories_and_can_be_joined(tmp_path: Path) ->
         assert two.mean == pytest.approx(one.mean, rel=1e-5)
 
 
+def test_runs_of_equal_names_are_all_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed in (1, 2):
+        folder = tmp_path / f"machine{seed}"
+        make_run(folder / "run", seed=seed)
+        monkeypatch.chdir(folder)
+        archived(tmp_path / f"{seed}.jsonl.gz", Path("run"))
+    both = archived(tmp_path / "both.jsonl.gz", *tmp_path.glob("?.jsonl.gz"))
+    assert sorted(run.config.seed for run in both) == [1, 2]
+
+
+def test_folders_of_archives_are_found_and_nothing_counts_twice(tmp_path: Path) -> None:
+    run = make_run(tmp_path / "runs" / "run")
+    kept = tmp_path / "kept" / "deep" / "all.jsonl.gz"
+    archived(kept, run)
+    assert [run.config.seed for run in load([tmp_path / "kept", kept])] == [1]
+    with pytest.raises(RaceError, match="same experiment with the same seed"):
+        plot([tmp_path / "runs", tmp_path / "kept"], tmp_path / "a.png")
+
+
+def test_settings_that_a_method_has_no_use_for_do_not_part_experiments() -> None:
+    def key(**changes: Any) -> str:
+        return experiment_key(resolve(Config(TASK, **changes)), ALGORITHM_VERSION)
+
+    alone = key(algo="matd3")
+    assert key(algo="matd3", race=RaceConfig(population_size=7)) == alone
+    assert key(algo="matd3", facmac=FacmacConfig(mixer_size=7)) == alone
+    assert key(algo="facmac", facmac=FacmacConfig(mixer_size=7)) != key(algo="facmac")
+    assert key(race=RaceConfig(population_size=7)) != key()
+
+
 def test_the_key_tells_experiments_apart() -> None:
     base = resolve(Config(TASK))
 
@@ -140,6 +170,11 @@ def test_what_is_no_archive_says_so(tmp_path: Path) -> None:
     bad.write_bytes(whole.read_bytes()[:-40])
     with pytest.raises(RunDirectoryError, match="no archive that this version"):
         load([bad])
+    flipped = bytearray(whole.read_bytes())
+    for place in range(12, len(flipped), len(flipped) // 60):
+        bad.write_bytes(bytes([*flipped[:place], flipped[place] ^ 64, *flipped[place + 1 :]]))
+        with pytest.raises(RunDirectoryError):
+            load([bad])
     for text in ("", "[]\n", json.dumps(archive.FORMAT) + "\n{}\n", '{"version": 9}\n'):
         bad.write_bytes(gzip.compress(text.encode()))
         with pytest.raises(RunDirectoryError, match="no archive that this version"):

@@ -14,7 +14,7 @@ from race.config.settings import Config, LearnerConfig
 from race.errors import RaceError, RunDirectoryError
 from race.statistics.intervals import mean_interval
 from race.viewing import plotting
-from race.viewing.curves import Curve, aggregate, ends
+from race.viewing.curves import Curve, aggregate, ended_early
 from race.viewing.plotting import plot
 
 
@@ -30,17 +30,23 @@ def make_run(path: Path, points: list[tuple[int, float]], **settings: Any) -> Pa
         row = {"kind": "evaluation", "env_steps": steps, "eval/marl/return_mean": value}
         if config.has_population:
             row["eval/champion/return_mean"] = value + 10
+            row["eval/best/return_mean"] = value + 10
         row["eval/selected/return_mean"] = value + (10 if config.has_population else 0)
         rows.append(row)
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return path
 
 
+def curve(x: list[float], values: list[float], seed: int = 1) -> Curve:
+    return Curve(np.array(x), np.array(values), x[-1], seed)
+
+
 def test_runs_evaluated_at_different_steps_meet_on_a_common_grid() -> None:
-    first = Curve(np.array([0.0, 10.0, 20.0]), np.array([0.0, 10.0, 20.0]))
-    second = Curve(np.array([0.0, 15.0, 20.0]), np.array([2.0, 17.0, 22.0]))
+    first = curve([0.0, 10.0, 20.0], [0.0, 10.0, 20.0])
+    second = curve([5.0, 15.0, 20.5], [7.0, 17.0, 22.5])
     band = aggregate([first, second])
-    assert band.x.tolist() == [0.0, 10.0, 15.0, 20.0]
+    # Where both have been tested, and no ragged ends of one of them.
+    assert band.x.tolist() == [5.0, 10.0, 15.0, 20.0]
     np.testing.assert_allclose(band.mean, band.x + 1.0)
     assert band.seeds.tolist() == [2] * 4
     # t(0.975, 1) = 12.7062; s = sqrt(2); half = t.
@@ -48,23 +54,43 @@ def test_runs_evaluated_at_different_steps_meet_on_a_common_grid() -> None:
 
 
 def test_a_run_that_stopped_early_does_not_cut_the_others() -> None:
-    whole = [Curve(np.array([0.0, 10.0, 20.0]), np.full(3, v), i) for i, v in enumerate((1.0, 2.0))]
-    short = Curve(np.array([0.0, 10.0]), np.array([6.0, 6.0]), 7)
+    whole = [curve([0.0, 10.0, 20.0], [v] * 3, i) for i, v in enumerate((1.0, 2.0))]
+    short = curve([0.0, 10.0], [6.0, 6.0], 7)
     band = aggregate([*whole, short])
     assert band.x.tolist() == [0.0, 10.0, 20.0]
     np.testing.assert_allclose(band.mean, [3.0, 3.0, 1.5])
     assert band.seeds.tolist() == [3, 3, 2]
-    assert [run.seed for run in ends([*whole, short])] == [7]
-    assert ends(whole) == []
+    assert [run.seed for run in ended_early([*whole, short])] == [7]
+    assert ended_early(whole) == []
+
+
+def test_over_time_a_slow_run_is_no_run_that_ended_late() -> None:
+    runs = [
+        Curve(np.array([0.0, seconds]), np.array([0.0, 10.0]), 100.0) for seconds in (50.0, 90.0)
+    ]
+    assert ended_early(runs) == []
+    band = aggregate(runs)
+    assert (band.x[-1], band.seeds.tolist()) == (50.0, [2, 2])
+    assert band.mean[-1] == pytest.approx((10.0 + 10.0 * 50 / 90) / 2)
 
 
 def test_runs_without_a_common_range_are_each_where_they_are() -> None:
-    band = aggregate(
-        [Curve(np.array([0.0, 1.0]), np.ones(2)), Curve(np.array([5.0, 6.0]), np.zeros(2))]
-    )
-    assert band.x.tolist() == [0.0, 1.0, 5.0, 6.0]
-    assert band.mean.tolist() == [1.0, 1.0, 0.0, 0.0]
+    band = aggregate([curve([0.0, 1.0], [1.0, 1.0]), curve([0.98, 1.02], [0.0, 0.0])])
+    assert band.x.tolist() == [0.98, 1.0]
+    band = aggregate([curve([100.0], [1.0]), curve([101.0], [0.0])])
+    assert band.x.tolist() == [100.0, 101.0]
+    assert band.mean.tolist() == [1.0, 0.0]
     assert np.isnan(band.low).all()
+
+
+def test_the_last_point_is_that_of_all_seeds_though_their_last_tests_differ(tmp_path: Path) -> None:
+    for seed in range(1, 6):
+        ends = [(100, 10.0 * seed), (1000 + seed, 20.0 * seed)]
+        make_run(tmp_path / f"s{seed}", ends, algo="matd3", seed=seed)
+    (summary,) = plot([tmp_path], tmp_path / "a.png").summaries
+    assert (summary.seeds, summary.x) == (5, 1001.0)
+    assert summary.ended_early == ()
+    assert summary.low < summary.mean < summary.high
 
 
 def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
@@ -80,7 +106,7 @@ def test_runs_are_grouped_by_task_and_method(tmp_path: Path) -> None:
         ("mamujoco/Ant-2x4", "RACE(MATD3)"),
     }
     race = found["mamujoco/Hopper-3x1", "RACE(MATD3)"]
-    assert (race.seeds, race.env_steps) == (2, 200)
+    assert (race.seeds, race.x) == (2, 200)
     assert race.mean == pytest.approx(125.0)
     expected = mean_interval([110.0, 140.0])
     assert (race.low, race.high) == pytest.approx((expected.low, expected.high))
@@ -170,6 +196,20 @@ def lines_of(monkeypatch: pytest.MonkeyPatch, paths: list[Path], out: Path, **ho
     return panels[0]
 
 
+@pytest.mark.parametrize("team", ["marl", "champion", "best"])
+def test_bands_are_there_whatever_team_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, team: str
+) -> None:
+    for seed in range(1, 5):
+        points = [(100, 10.0 * seed), (200, 20.0 * seed)]
+        for algo in ("race", "matd3", "maddpg"):
+            make_run(tmp_path / f"{algo}{seed}", points, algo=algo, seed=seed)
+    axes = lines_of(monkeypatch, [tmp_path], tmp_path / "a.png", team=team)
+    assert len(axes.collections) == 3
+    # All teams of a method together are lines alone.
+    assert not lines_of(monkeypatch, [tmp_path], tmp_path / "a.png", team="all").collections
+
+
 @pytest.mark.parametrize("seeds", [2, 3, 4])
 def test_few_seeds_are_shown_themselves_and_many_as_a_band(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, seeds: int
@@ -207,4 +247,4 @@ def test_wall_time_on_the_axis(tmp_path: Path) -> None:
     text = (run / "metrics.jsonl").read_text()
     (run / "metrics.jsonl").write_text(text.replace('"env_steps": 200', '"wall_seconds": 90.0'))
     (summary,) = plot([run], tmp_path / "a.png", axis="wall_time").summaries
-    assert summary.env_steps == 90
+    assert summary.x == 90
