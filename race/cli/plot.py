@@ -43,7 +43,7 @@ def main(arguments: list[str]) -> None:
         raise RunDirectoryError("Say which runs to draw: race plot DIR [DIR ...] --out curves.png")
 
     def place(x: float) -> str:
-        return duration(x) if chosen.x == "wall_time" else f"{x:,.0f} environment steps"
+        return duration(60 * x) if chosen.x == "wall_time" else f"{x:,.0f} environment steps"
 
     drawn = plot(chosen.runs, chosen.out, chosen.metric, chosen.team, chosen.x)
     for row in drawn.summaries:

@@ -62,6 +62,16 @@ def parse_seeds(text: str) -> list[int]:
     return seeds
 
 
+def check_jobs(jobs: int | None) -> None:
+    """Refuses a number of jobs that is none.
+
+    Raises:
+        ConfigError: if there would be none.
+    """
+    if jobs is not None and jobs < 1:
+        raise ConfigError(f"--jobs is {jobs}, but it must be at least 1.")
+
+
 def directories_of(path: Path) -> list[Path]:
     """The runs of several seeds in ``path``, in order of their seeds; none if it holds none."""
     found = [file.parent for file in path.glob("seed*/config.json")]
@@ -187,7 +197,9 @@ def run_all(
 
     Raises:
         RunDirectoryError: if a run failed; the others are trained to their end first.
+        ConfigError: if there would be no job at a time, or nothing to extend.
     """
+    check_jobs(jobs)
     console = console or Console()
     if env_steps is not None:
         _extend(path, env_steps)

@@ -101,14 +101,13 @@ def main(arguments: list[str]) -> None:
 
 def _create_all(path: Path, config: Config, chosen: Train, described: dict[str, Any]) -> None:
     """Makes the run directories of several seeds, or none."""
-    from race.cli.seeds import parse_seeds
+    from race.cli.seeds import check_jobs, parse_seeds
     from race.runs import directory as run_directory
 
     seeds = parse_seeds(str(chosen.seeds))
     if chosen.seed != 1:
         raise ConfigError("--seed and --seeds are two ways to say it; leave one out.")
-    if chosen.jobs is not None and chosen.jobs < 1:
-        raise ConfigError(f"--jobs is {chosen.jobs}, but it must be at least 1.")
+    check_jobs(chosen.jobs)
     configs = [resolve(dataclasses.replace(config, seed=seed)) for seed in seeds]
     places = [path / f"seed{seed}" for seed in seeds]
     for place in (path, *places):

@@ -22,12 +22,16 @@ LABELS = {
     "best": "best of two tests",
 }
 Axis = Literal["env_steps", "wall_time"]
-_KEY_OF_AXIS = {"env_steps": "env_steps", "wall_time": "wall_seconds"}
+# Key of the rows, and how many of its units are one on the axis.
+_AXES: dict[Axis, tuple[str, float]] = {
+    "env_steps": ("env_steps", 1.0),
+    "wall_time": ("wall_seconds", 60.0),
+}
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """One quantity of one run over environment steps, or over seconds."""
+    """One quantity of one run over environment steps, or over minutes."""
 
     x: NDArray[np.float64]
     values: NDArray[np.float64]
@@ -88,9 +92,9 @@ def keys(metric: str, team: str, config: Config) -> dict[str, str]:
         return {"": metric}
     if team == "all" and config.has_population:
         return {LABELS[name]: f"eval/{name}/{metric}" for name in TEAMS}
-    # Without a population there is the MARL team alone, whatever the choice.
-    name = team if config.has_population and team != "all" else "marl"
-    return {"" if team in ("selected", "all") else LABELS[name]: f"eval/{name}/{metric}"}
+    if not config.has_population:  # there is the MARL team alone, whatever the choice
+        return {"": f"eval/marl/{metric}"}
+    return {"" if team == "selected" else LABELS[team]: f"eval/{team}/{metric}"}
 
 
 def names_of(runs: Sequence[Recorded]) -> list[str]:
@@ -134,9 +138,9 @@ def refuse_twins(runs: Sequence[Recorded]) -> None:
 
 def curve_of(run: Recorded, key: str, axis: Axis) -> Curve | None:
     """The values of a key, or None where the run has none."""
-    over = _KEY_OF_AXIS[axis]
+    over, unit = _AXES[axis]
     points = [
-        (float(row[over]), float(row[key]))
+        (float(row[over]) / unit, float(row[key]))
         for row in run.rows
         if _is_number(row.get(key)) and _is_number(row.get(over))
     ]

@@ -44,7 +44,7 @@ class Summary(NamedTuple):
     seeds: int
     """At the last point."""
     x: float
-    """Environment steps of the last point; with time on the axis, seconds."""
+    """Environment steps of the last point; with time on the axis, minutes."""
     mean: float
     low: float  # of the 95% interval; NaN with one seed
     high: float
@@ -201,7 +201,6 @@ def _frame(axes: Axes, task: str, metric: str, axis: Axis) -> None:
         )
     else:
         axes.set_xlabel("wall time (minutes)")
-        axes.xaxis.set_major_formatter(lambda x, _: f"{x / 60:g}")
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(

@@ -234,7 +234,7 @@ def with_junk_in_padding(case: Case) -> Any:
         rows = np.concatenate([obs_rows, ~np.asarray(case.spec.action_mask)], axis=1)
         weight = jnp.where(rows[:, :, None], 1e3, utilities.first.weight)
         first = type(utilities.first)(weight, utilities.first.bias)
-        spoiled = type(utilities)(first, utilities.hidden, utilities.out)
+        spoiled = dataclasses.replace(utilities, first=first)
         return type(critic)(spoiled, critic.mixer)
 
     def spoil_pevfa(pevfa: Any) -> Any:
