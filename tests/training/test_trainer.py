@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from whole_runs import KilledError, rows, run
 
-from race import ALGORITHM_VERSION, programs
+from race import programs
 from race.config.presets import resolve
 from race.config.settings import (
     CheckpointConfig,
@@ -25,10 +25,9 @@ from race.config.settings import (
     RaceConfig,
 )
 from race.envs import factorised
-from race.errors import CheckpointError, DivergenceError
+from race.errors import DivergenceError
 from race.runs import checkpoints
-from race.teams.trained import load_trained
-from race.training import generation, saving, trainer
+from race.training import generation, trainer
 from race.training.run_state import Progress
 from race.training.trainer import train
 from race.types import Task
@@ -261,23 +260,6 @@ def test_what_is_not_finite_stops_the_run(
     arrays = checkpoints.load(newest).arrays
     assert all(np.isfinite(a).all() for a in arrays.values() if a.dtype == np.float32)
     assert not (tmp_path / "DONE").exists()
-
-
-def test_a_run_goes_on_only_with_the_algorithm_that_began_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = small(algo="matd3")
-    with monkeypatch.context() as older:
-        older.setattr(saving, "ALGORITHM_VERSION", ALGORITHM_VERSION - 1)
-        run(tmp_path, whole)
-    longer = dataclasses.replace(whole, env_steps=2 * whole.env_steps)
-    before = rows(tmp_path)
-    with pytest.raises(CheckpointError, match="another version of race") as refused:
-        train(tmp_path, longer, extend=True)
-    assert "metadata.json" in str(refused.value)
-    assert rows(tmp_path) == before
-    # Whoever only looks at it may.
-    assert load_trained(tmp_path).progress.env_steps >= whole.env_steps
 
 
 def _command(path: Path, *extra: str) -> list[str]:
