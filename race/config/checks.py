@@ -134,7 +134,8 @@ def check(config: Config) -> None:
             race.population_size,
             f"at least {4 + race.elite_copy}: an elite, a second parent, "
             f"{'a copy of the elite, ' * race.elite_copy}a team for their offspring and one for "
-            f"the injected MARL team (for no population use --algo {config.base})",
+            f"the injected MARL team (4 do with --race.no-elite-copy; for no population use --algo "
+            f"{config.base})",
         ),
         (
             0 <= race.mutation_fraction <= 1,

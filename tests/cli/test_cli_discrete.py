@@ -24,6 +24,7 @@ from race.types import DiscreteTask
 MIXER = "--facmac.mixer-size 3 --facmac.hypernet-size 4"
 RACE = (
     "--race.policy-embedding-size 4 --race.mine-size 5 --race.population-size 4 "
+    "--race.no-elite-copy "
     "--evaluation.every 40 --evaluation.episodes 2"
 )
 SMALL = (
@@ -362,7 +363,8 @@ def test_every_setting_of_facmac_is_tried() -> None:
 
     from race.config.settings import FacmacConfig
 
-    assert set(OUT_OF_RANGE) == {f.name.replace("_", "-") for f in fields(FacmacConfig)}
+    ranged = [f.name for f in fields(FacmacConfig) if f.type is not bool]
+    assert set(OUT_OF_RANGE) == {name.replace("_", "-") for name in ranged}
 
 
 @pytest.mark.parametrize(
