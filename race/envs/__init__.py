@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 import gymnasium
 import numpy as np
 
+from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
 from race.envs import discrete_probe, mamujoco, probe
 from race.errors import TaskError, blamed
@@ -54,13 +55,15 @@ class TaskInfo(NamedTuple):
 
 
 def describe_tasks() -> tuple[TaskInfo, ...]:
-    """All tasks that have a name: the paper's sixteen, other MuJoCo ones, then probes."""
+    """All tasks that have a name: the paper's sixteen, other MuJoCo ones, other maps, probes."""
     known = [f"mamujoco/{s}-{p}" for s, ps in mamujoco.KNOWN_PARTITIONS.items() for p in ps]
     others = [name for name in known if name not in _PAPER_NAMES]
+    battles = _describe_battles()
     return (
         *(TaskInfo(name, _describe(name), _PAPER_NAMES[name]) for name in _PAPER_NAMES),
-        *_describe_battles(),
+        *(info for info in battles if info.paper_name),
         *(TaskInfo(name, _describe(name), None) for name in others),
+        *(info for info in battles if not info.paper_name),
         *(TaskInfo(name, info.description, None) for name, info in probe.PROBES.items()),
         *(TaskInfo(name, info.description, None) for name, info in discrete_probe.PROBES.items()),
     )
@@ -90,12 +93,11 @@ def _describe(name: str) -> str:
 def _describe_battles() -> tuple[TaskInfo, ...]:
     # Read here, because importing race.envs.micro imports jax, which takes longer than a listing.
     folder = Path(__file__).parent / "micro" / "maps"
-    return tuple(
-        TaskInfo(
-            _MICRO + path.stem, tomllib.loads(path.read_text("utf-8"))["description"], path.stem
-        )
-        for path in sorted(folder.glob("*.toml"))
-    )
+    found = []
+    for path in sorted(folder.glob("*.toml")):
+        name, text = _MICRO + path.stem, tomllib.loads(path.read_text("utf-8"))["description"]
+        found.append(TaskInfo(name, text, path.stem if name in TABLE_4 else None))
+    return tuple(found)
 
 
 def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:

@@ -4,7 +4,7 @@
     env_state, observation = battle.reset(key)
     env_state, timestep = battle.step(env_state, actions, key)
 
-Both functions can be jitted, vmapped and scanned. The eight maps of the paper come with the
+Both functions can be jitted, vmapped and scanned. All 23 maps of SMAC come with the
 package; a map of your own is a text file (`race.envs.micro.maps`).
 """
 
@@ -58,7 +58,7 @@ class Battle:
         return self.scenario.shape
 
     def reset(self, key: Key[Array, ""]) -> tuple[EnvState, Observation]:
-        """A new battle. The start is the same for every key, as in SMAC's maps."""
+        """A new battle. Where units start is the same for every key, as in SMAC's maps."""
         state: tuple[EnvState, Observation] = _reset(self.scenario, key)
         return state
 

@@ -8,6 +8,10 @@ from numpy.typing import NDArray
 from race.envs.micro.units import GROUND, UNIT_TYPES, Mover, UnitType
 from race.errors import TaskError
 
+COLOSSUS_TAKES_ROOM = False
+"""Whether a Colossus keeps others of its group from starting below it. It does not collide with
+ground units, and recorded battles show a Stalker at its place (1c3s5z); they leave some doubt."""
+
 
 class Start(NamedTuple):
     """A unit at the start: its type and the place of its centre."""
@@ -79,12 +83,16 @@ def _fits(cells: NDArray[Any], unit: UnitType, start: Start, placed: list[Start]
     width, height = cells.shape
     if not (0 <= x < width and 0 <= y < height):
         return False
-    flies = unit.mover is Mover.AIR
-    if not flies and cells[x, y] != GROUND:
+    if unit.mover is not Mover.AIR and cells[x, y] != GROUND:
         return False
     return all(
         math.hypot(start.x - other.x, start.y - other.y)
         >= unit.radius + UNIT_TYPES[other.unit].radius - 1e-6
         for other in placed
-        if (UNIT_TYPES[other.unit].mover is Mover.AIR) == flies
+        if _plane(UNIT_TYPES[other.unit]) == _plane(unit)
     )
+
+
+def _plane(unit: UnitType) -> Mover:
+    """Units of one plane take each other's room."""
+    return Mover.GROUND if COLOSSUS_TAKES_ROOM and unit.mover is Mover.CLIFF else unit.mover

@@ -1,6 +1,6 @@
 """Maps as text: who fights whom, where they start, what the ground is like.
 
-A map is a TOML file. The eight of the paper lie in the folder ``maps`` beside this module; a file
+A map is a TOML file. All 23 of SMAC lie in the folder ``maps`` beside this module; a file
 of your own needs nothing else::
 
     description = "three Marines on each side"
@@ -18,7 +18,7 @@ of your own needs nothing else::
 
     [enemy_order]
     kind = "attack_move"  # or "attack_nearest", or "hold"
-    to = [9.0, 16.0]
+    to = [9.0, 16.0]      # or to_between = [[9.0, 12.0], [9.0, 20.0]]: drawn for each battle
 
     [terrain]             # optional; without it a 32 x 32 plain
     cells = \"\"\"
@@ -41,7 +41,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.envs.micro.lattice import Group, Start, place
-from race.envs.micro.units import GROUND, UNIT_TYPES
+from race.envs.micro.units import GROUND, HALF_TILE, HALF_TILES_ARE, UNIT_TYPES
 from race.errors import TaskError
 
 OrderKind = Literal["attack_move", "attack_nearest", "hold"]
@@ -76,6 +76,10 @@ class EnemyOrder(NamedTuple):
     kind: OrderKind
     x: float = 0.0
     y: float = 0.0
+    spread_x: float = 0.0
+    """The point of each battle is drawn from the segment of which (x, y) is the middle and
+    (x + spread_x, y + spread_y) one end."""
+    spread_y: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,8 @@ class MapSpec:
         ally_type_columns: unit types of the allies' one-hot columns; empty without any.
         enemy_type_columns: likewise, and as many.
         enemy_order: what the enemies do.
-        rows: cells of the map, the north first: "." ground, "#" wall or pit, "C" cliff.
+        rows: cells of the map, the north first: "." ground, "#" wall or pit, "C" cliff, "/" half
+            a tile of ground (`race.envs.micro.units.HALF_TILES_ARE`).
     """
 
     name: str
@@ -107,7 +112,8 @@ class MapSpec:
     @cached_property
     def cells(self) -> NDArray[Any]:
         """Kind of each cell, indexed [x, y], y upwards."""
-        return np.array([list(row) for row in self.rows])[::-1].T
+        rows = [list(row.replace(HALF_TILE, HALF_TILES_ARE)) for row in self.rows]
+        return np.array(rows)[::-1].T
 
     @cached_property
     def allies(self) -> tuple[Start, ...]:
@@ -235,14 +241,26 @@ def _columns(name: str, table: dict[str, Any], key: str) -> tuple[str, ...]:
 def _order(name: str, table: dict[str, Any]) -> EnemyOrder:
     order = table.get("enemy_order")
     kind: Any = order.get("kind") if isinstance(order, dict) else None
-    known = {"kind"} if kind in ("attack_nearest", "hold") else {"kind", "to"}
+    points = {"to_between"} if isinstance(order, dict) and "to_between" in order else {"to"}
+    known = {"kind"} | (set() if kind in ("attack_nearest", "hold") else points)
     order = _table(name, "'enemy_order'", order, known)
     if kind not in get_args(OrderKind):
         raise TaskError(
             f"Map {name}: kind of enemy_order must be one of {', '.join(get_args(OrderKind))}, and "
             f"is {kind!r}."
         )
-    return EnemyOrder(kind, *(_point(name, order, "to") if kind == "attack_move" else (0.0, 0.0)))
+    if kind != "attack_move":
+        return EnemyOrder(kind)
+    if "to" in order:
+        return EnemyOrder(kind, *_point(name, order, "to"))
+    ends = order.get("to_between")
+    if not isinstance(ends, list) or len(ends) != 2:
+        raise TaskError(
+            f"Map {name}: 'to_between' of 'enemy_order' must be two points, and is {ends!r}; or "
+            "name one point by 'to'."
+        )
+    (x, y), (last_x, last_y) = (_point(name, {"to_between": end}, "to_between") for end in ends)
+    return EnemyOrder(kind, (x + last_x) / 2, (y + last_y) / 2, (last_x - x) / 2, (last_y - y) / 2)
 
 
 def _rows(name: str, table: dict[str, Any]) -> tuple[str, ...]:
@@ -250,9 +268,10 @@ def _rows(name: str, table: dict[str, Any]) -> tuple[str, ...]:
         return PLAIN
     terrain = _table(name, "'terrain'", table["terrain"], {"cells"})
     rows = tuple(_entry(name, terrain, "cells", str).split())
-    if len({len(row) for row in rows}) != 1 or not re.fullmatch(r"[.#C]+", "".join(rows)):
+    if len({len(row) for row in rows}) != 1 or not re.fullmatch(r"[.#C/]+", "".join(rows)):
         raise TaskError(
-            f"Map {name}: cells of the terrain must be lines of equal length out of '.', '#', 'C'."
+            f"Map {name}: cells of the terrain must be lines of equal length out of '.', '#', 'C' "
+            "and '/'."
         )
     if max(len(rows), len(rows[0])) > _MOST:
         raise TaskError(f"Map {name}: the terrain must not be longer than {_MOST} cells.")
@@ -285,8 +304,10 @@ def _check(spec: MapSpec) -> None:
         )
     width, height = spec.cells.shape
     order = spec.enemy_order
-    if not (0 <= order.x < width and 0 <= order.y < height):
-        raise TaskError(
-            f"Map {name}: 'to' of 'enemy_order' is ({order.x:g}, {order.y:g}), beyond the "
-            f"map of {width} x {height} cells."
-        )
+    for side in (-1, 0, 1):
+        x, y = order.x + side * order.spread_x, order.y + side * order.spread_y
+        if not (0 <= x < width and 0 <= y < height):
+            raise TaskError(
+                f"Map {name}: 'to' of 'enemy_order' is ({x:g}, {y:g}), beyond the map of {width} x "
+                f"{height} cells."
+            )

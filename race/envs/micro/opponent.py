@@ -118,8 +118,10 @@ class March(NamedTuple):
 def march(scenario: Scenario, units: Units, target: Int[Any, "m"]) -> March:
     """Each enemy's place at its goal; flyers stay over their army while it fights."""
     shape = scenario.shape
+    goal_x = scenario.goal_x + jnp.sum(units.goal_shift[:, 0])
+    goal_y = scenario.goal_y + jnp.sum(units.goal_shift[:, 1])
     if not shape.flyers:
-        return March(scenario.goal_x, scenario.goal_y)
+        return March(goal_x, goal_y)
     n = shape.n_allies
     flies = scenario.flying[n:]
     army = jnp.where(flies, 0.0, (units.health[n:] > 0).astype(jnp.float32))
@@ -128,6 +130,6 @@ def march(scenario: Scenario, units: Units, target: Int[Any, "m"]) -> March:
     hovers = flies & fights
     share = army / jnp.maximum(size, 1.0)
     return March(
-        jnp.where(hovers, jnp.sum(share * units.x[n:]), scenario.goal_x),
-        jnp.where(hovers, jnp.sum(share * units.y[n:]), scenario.goal_y),
+        jnp.where(hovers, jnp.sum(share * units.x[n:]), goal_x),
+        jnp.where(hovers, jnp.sum(share * units.y[n:]), goal_y),
     )

@@ -145,6 +145,8 @@ class Scenario:
     goal_x: Float[Any, "m"]
     """Where an enemy walks that has nothing to fight."""
     goal_y: Float[Any, "m"]
+    goal_spread: Float[Any, "goals 2"]
+    """Half of the segment from which a battle's goals are drawn; none where they are fixed."""
 
     # Crowding.
     contact: Float[Any, "U U"]
@@ -235,6 +237,7 @@ def _build(spec: MapSpec) -> Scenario:
         reluctance=_reluctance(types, n, damage),
         goal_x=_f(goals[n:, 0]),
         goal_y=_f(goals[n:, 1]),
+        goal_spread=_spread(spec),
         contact=contact,
         stiffness=stiffness,
         cooldown_scale=_f(
@@ -366,6 +369,11 @@ def _goals(spec: MapSpec, places: NDArray[np.float64]) -> NDArray[np.float64]:
             if not inside or spec.cells[x, y] != GROUND:
                 goals[k] = point
     return goals
+
+
+def _spread(spec: MapSpec) -> NDArray[np.float32]:
+    spread = spec.enemy_order.spread_x, spec.enemy_order.spread_y
+    return _f([spread] if any(spread) else np.zeros((0, 2)))
 
 
 def _contacts(types: list[UnitType]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

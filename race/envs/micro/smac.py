@@ -64,9 +64,8 @@ def view(units: Units) -> View:
 
 
 def reset(scenario: Scenario, key: Key[Array, ""]) -> tuple[EnvState, Observation]:
-    """A new battle. The start is the same for every key, as in SMAC's maps."""
-    del key
-    env_state = start(scenario)
+    """A new battle. Where units start is the same for every key, as in SMAC's maps."""
+    env_state = start(scenario, key)
     return env_state, observe(scenario, view(env_state.units), env_state.last_actions)
 
 

@@ -2,8 +2,9 @@
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from race.envs.micro.scenario import Scenario
 from race.envs.micro.units import START_ENERGY
@@ -47,6 +48,9 @@ class Units(NamedTuple):
     """Whether the unit has burst."""
     beam: Float[Any, "beams 4"]
     """Middle (x, y) of each beam's line and the direction (x, y) of the shot across it."""
+    goal_shift: Float[Any, "goals 2"]
+    """From the middle of where enemies may be sent to where they are sent in this battle; none on
+    maps that always send them to the same point."""
 
 
 class EnvState(NamedTuple):
@@ -60,9 +64,16 @@ class EnvState(NamedTuple):
     """Whether the battle has ended; further steps change nothing."""
 
 
-def start(scenario: Scenario) -> EnvState:
-    """The start of a battle. There is no chance in it: every battle begins the same."""
+def start(scenario: Scenario, key: Key[Array, ""] | None = None) -> EnvState:
+    """The start of a battle.
+
+    Args:
+        scenario: the map.
+        key: of what maps leave to chance, the enemies' point of attack on 2m_vs_1z. None: the
+            middle.
+    """
     shape = scenario.shape
+    along = jnp.zeros(()) if key is None else jax.random.uniform(key, minval=-1.0)
     zeros = jnp.zeros(shape.n_units)
     nobody = jnp.full(shape.n_units, NOBODY, jnp.int32)
     units = Units(
@@ -83,6 +94,7 @@ def start(scenario: Scenario) -> EnvState:
         struck_by=jnp.full(shape.n_enemies, NOBODY, jnp.int32),
         burst=zeros > 0,
         beam=jnp.zeros((shape.n_beams, 4)),
+        goal_shift=along * scenario.goal_spread,
     )
     return EnvState(
         units,

@@ -17,6 +17,11 @@ WALL: Final = "#"
 """A wall or a pit."""
 CLIFF: Final = "C"
 """A cliff between two levels of ground."""
+HALF_TILE: Final = "/"
+"""A cell of a cliff tile cut diagonally that lies on the floor's side, though the map's flags block
+it. Whether the game's grid, and so SMAC's mask, counts it as ground is not known."""
+HALF_TILES_ARE: Final = GROUND
+"""What these cells are taken for: GROUND or WALL. As walls they part corridor in three."""
 
 
 class Mover(enum.IntEnum):
@@ -243,18 +248,6 @@ UNIT_TYPES: Final[dict[str, UnitType]] = {
         rank=5,
         smac_cooldown=MAX_ENERGY,
     ),
-    "Zergling": UnitType(
-        health=35.0,
-        attributes=frozenset({"light", "biological"}),
-        radius=0.375,
-        separation=0.375,
-        inner_radius=0.375,
-        speed=2.9531,
-        health_regeneration=ZERG_REGENERATION,
-        letter="z",
-        rank=6,
-        weapon=Weapon(damage=5.0, period=0.696, range=0.1),
-    ),
     "Baneling": UnitType(
         health=30.0,
         attributes=frozenset({"biological"}),
@@ -264,7 +257,8 @@ UNIT_TYPES: Final[dict[str, UnitType]] = {
         speed=2.5,
         health_regeneration=ZERG_REGENERATION,
         letter="b",
-        rank=7,
+        rank=6,
+        smac_cooldown=1.0,
         weapon=Weapon(
             damage=20.0,
             bonus=15.0,
@@ -274,6 +268,35 @@ UNIT_TYPES: Final[dict[str, UnitType]] = {
             damage_point=0.0,
             burst=2.2,
             burst_on_structures=80.0,
+        ),
+    ),
+    "Zergling": UnitType(
+        health=35.0,
+        attributes=frozenset({"light", "biological"}),
+        radius=0.375,
+        separation=0.375,
+        inner_radius=0.375,
+        speed=2.9531,
+        health_regeneration=ZERG_REGENERATION,
+        letter="z",
+        rank=7,
+        smac_cooldown=11.0,
+        weapon=Weapon(damage=5.0, period=0.696, range=0.1),
+    ),
+    "Hydralisk": UnitType(
+        health=80.0,
+        attributes=frozenset({"light", "biological"}),
+        radius=0.625,
+        separation=0.5,
+        inner_radius=0.375,
+        speed=2.25,
+        health_regeneration=ZERG_REGENERATION,
+        letter="H",
+        rank=8,
+        smac_cooldown=10.0,
+        # Within 0.5 it strikes with its claws: the same damage 0.09 s later, left out here.
+        weapon=Weapon(
+            damage=12.0, period=0.83, range=5.0, damage_point=0.208, missile_speed=40.0, air=True
         ),
     ),
     "SpineCrawler": UnitType(
@@ -286,7 +309,7 @@ UNIT_TYPES: Final[dict[str, UnitType]] = {
         speed=0.0,
         health_regeneration=ZERG_REGENERATION,
         letter="#",
-        rank=8,
+        rank=9,
         # How long its tentacle takes is not documented; 0.2 to 0.4 s are plausible.
         weapon=Weapon(
             damage=25.0,

@@ -23,15 +23,15 @@ MANNERS = {
 }
 SPEED = {
     **dict.fromkeys(("Stalker", "Zergling"), 2.9531),
-    **dict.fromkeys(("Zealot", "Colossus", "Marine", "Marauder"), 2.25),
+    **dict.fromkeys(("Zealot", "Colossus", "Marine", "Marauder", "Hydralisk"), 2.25),
     **{"Medivac": 2.75, "Baneling": 2.5, "SpineCrawler": 0.0},
 }
 HEALTH = {
     **{"Stalker": 80, "Zealot": 100, "Colossus": 200, "Marine": 45, "Marauder": 125},
-    **{"Medivac": 150, "Zergling": 35, "Baneling": 30, "SpineCrawler": 300},
+    **{"Medivac": 150, "Zergling": 35, "Baneling": 30, "Hydralisk": 80, "SpineCrawler": 300},
 }
 SHIELD = {"Stalker": 80, "Zealot": 50, "Colossus": 150}
-ZERG = ("Zergling", "Baneling", "SpineCrawler")
+ZERG = ("Zergling", "Baneling", "Hydralisk", "SpineCrawler")
 PATIENTS = ("Marine", "Marauder", "Zealot", *ZERG)
 RADIUS = {"Marine": 0.375, "Marauder": 0.5625, "Medivac": 0.75}
 

@@ -18,8 +18,9 @@ TYPES = {
     "Marine": (45, 0, 15),
     "Marauder": (125, 0, 25),
     "Medivac": (150, 0, 200),
-    "Zergling": (35, 0, 0),
-    "Baneling": (30, 0, 0),
+    "Zergling": (35, 0, 11),
+    "Baneling": (30, 0, 1),
+    "Hydralisk": (80, 0, 10),
     "SpineCrawler": (300, 0, 0),
 }
 
@@ -82,6 +83,73 @@ TABLE = {
     ),
     "3s_vs_3z": Table(
         *(3 * ["Stalker"], 3 * ["Zealot"], 150, 680, (9, 36, 54), [], [], [(0, 0, 31, 31)], []),
+    ),
+}
+
+HALVES = {
+    "octagon": [
+        *((10, 6, 21, 6), (9, 7, 22, 7), (8, 8, 23, 8), (7, 9, 24, 9), (6, 10, 25, 21)),
+        *((7, 22, 24, 22), (8, 23, 23, 23), (9, 24, 22, 24), (10, 25, 21, 25)),
+    ],
+    "room": [
+        *((0, 0, 31, 5), (0, 6, 7, 7), (22, 6, 31, 7), (0, 8, 5, 19), (10, 8, 19, 8)),
+        *((24, 8, 31, 19), (9, 9, 20, 9), (8, 10, 21, 17), (9, 18, 20, 18), (10, 19, 19, 19)),
+        *((0, 20, 7, 21), (22, 20, 31, 21), (0, 22, 31, 31)),
+    ],
+    "corridor": [
+        *((2, 2, 11, 10), (2, 11, 12, 11), (11, 12, 13, 12), (12, 13, 14, 13), (13, 14, 25, 14)),
+        *((14, 15, 26, 15), (14, 16, 27, 16), (13, 17, 28, 17), (12, 18, 29, 21)),
+        *((13, 22, 29, 22), (14, 23, 29, 23), (15, 24, 29, 24), (16, 25, 29, 25)),
+        *((17, 26, 29, 26), (18, 27, 29, 27), (19, 28, 29, 28), (20, 29, 29, 29)),
+    ],
+}
+"""Grounds with half tiles, which count as ground."""
+ALL = [(0, 0, 31, 31)]
+BOTH = ["Baneling", "Zergling"]
+THIRD = ["Colossus"] + 3 * ["Stalker"] + 5 * ["Zealot"]
+FOES = 3 * ["Stalker"] + 6 * ["Zealot"]
+BANES = 4 * ["Baneling"] + 20 * ["Zergling"]
+
+
+def marines(allies: int, enemies: int, limit: int, reward: int, *sizes: int) -> Table:
+    sides = allies * ["Marine"], enemies * ["Marine"]
+    return Table(*sides, limit, reward, sizes, [], [], BAND, [])  # type: ignore[arg-type]
+
+
+TABLE |= {
+    "3m": marines(3, 3, 60, 365, 9, 30, 48),
+    "8m": marines(8, 8, 120, 640, 14, 80, 168),
+    "25m": marines(25, 25, 150, 1575, 31, 250, 950),
+    "5m_vs_6m": marines(5, 6, 70, 530, 12, 55, 98),
+    "8m_vs_9m": marines(8, 9, 120, 695, 15, 85, 179),
+    "10m_vs_11m": marines(10, 11, 150, 805, 17, 105, 243),
+    "27m_vs_30m": marines(27, 30, 180, 1850, 36, 285, 1170),
+    "3s_vs_4z": Table(
+        *(3 * ["Stalker"], 4 * ["Zealot"], 200, 840, (10, 42, 61), [], [], ALL, []),
+    ),
+    "3s_vs_5z": Table(
+        *(3 * ["Stalker"], 5 * ["Zealot"], 250, 1000, (11, 48, 68), [], [], ALL, []),
+    ),
+    "2m_vs_1z": Table(
+        *(2 * ["Marine"], ["Zealot"], 150, 360, (7, 16, 26), [], [], HALVES["octagon"], []),
+    ),
+    "1c3s5z": Table(
+        *(THIRD, THIRD, 180, 1870, (15, 162, 270)),
+        *(["Colossus", "Stalker", "Zealot"], ["Colossus", "Stalker", "Zealot"], BAND, []),
+    ),
+    "3s5z_vs_3s6z": Table(
+        *(PROTOSS[1], FOES, 170, 1670, (15, 136, 230), SWAPPED, SWAPPED[::-1], BAND, []),
+    ),
+    "bane_vs_bane": Table(
+        *(BANES, BANES[4:] + BANES[:4], 200, 1260, (30, 336, 984)),
+        *(BOTH, BOTH, HALVES["octagon"], []),
+    ),
+    "6h_vs_8z": Table(
+        *(6 * ["Hydralisk"], 8 * ["Zealot"], 150, 1480, (14, 78, 140), [], [], HALVES["room"], []),
+    ),
+    "corridor": Table(
+        *(6 * ["Zealot"], 24 * ["Zergling"], 400, 1280, (30, 156, 282)),
+        *([], [], HALVES["corridor"], []),
     ),
 }
 

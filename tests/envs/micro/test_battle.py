@@ -61,10 +61,14 @@ HITS: dict[str, dict[str, int]] = {
         "Stalker": 6, "Zealot": 7, "Colossus": 12, "Marine": 2, "Marauder": 5, "Zergling": 2,
         "Baneling": 2, "SpineCrawler": 11,
     },
+    "Hydralisk": {
+        "Stalker": 14, "Zealot": 14, "Colossus": 31, "Marine": 4, "Marauder": 12, "Medivac": 14,
+        "Zergling": 3, "Baneling": 3, "SpineCrawler": 30, "Hydralisk": 7,
+    },
 }  # fmt: skip
 BURSTS = {
     "Stalker": 9, "Zealot": 5, "Colossus": 19, "Marine": 2, "Marauder": 7, "Zergling": 1,
-    "Baneling": 2, "SpineCrawler": 4,
+    "Baneling": 2, "SpineCrawler": 4, "Hydralisk": 3,
 }  # fmt: skip
 # Seconds from the first hit to the last.
 TIMES: dict[str, dict[str, float]] = {
@@ -96,7 +100,19 @@ TIMES: dict[str, dict[str, float]] = {
         "Stalker": 8.00, "Zealot": 9.60, "Colossus": 17.60, "Marine": 1.60, "Marauder": 6.40,
         "Zergling": 1.60, "Baneling": 1.60, "SpineCrawler": 16.00,
     },
+    "Hydralisk": {
+        "Stalker": 10.79, "Zealot": 10.79, "Colossus": 24.90, "Marine": 2.49, "Marauder": 9.13,
+        "Medivac": 10.79, "Zergling": 1.66, "Baneling": 1.66, "SpineCrawler": 24.07,
+        "Hydralisk": 4.98,
+    },
 }  # fmt: skip
+# Hits on a Hydralisk, and seconds from the first to the last.
+ON_HYDRALISKS = {
+    "Stalker": (8, 10.08), "Zealot": (10, 5.08), "Colossus": (4, 2.20), "Marine": (14, 11.19),
+    "Marauder": (8, 10.50), "Zergling": (16, 10.44), "SpineCrawler": (4, 4.80),
+}  # fmt: skip
+for _attacker, (_hits, _seconds) in ON_HYDRALISKS.items():
+    HITS[_attacker]["Hydralisk"], TIMES[_attacker]["Hydralisk"] = _hits, _seconds
 DUELS = [(attacker, target) for attacker, row in HITS.items() for target in row]
 
 
@@ -207,6 +223,9 @@ def test_hits_and_time_to_kill(attacker: str, target: str) -> None:
         ("Stalker", "SpineCrawler", [(288, 0), (276, 0), (264, 0)]),
         ("Marauder", "Marauder", [(106, 0), (87, 0), (68, 0)]),
         ("Marine", "Medivac", [(145, 0), (140, 0)]),
+        ("Hydralisk", "Zealot", [(100, 38), (100, 26), (100, 14), (100, 2), (91, 0), (80, 0)]),
+        ("Zealot", "Hydralisk", [(72, 0), (64, 0), (56, 0), (48, 0)]),
+        ("Marine", "Zealot", [(100, 50 - 6 * k) for k in range(1, 9)] + [(97, 0), (92, 0)]),
     ],
 )
 def test_health_and_shield_after_each_hit(

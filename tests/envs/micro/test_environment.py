@@ -9,10 +9,11 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from chosen import MAPS
 from gymnasium.utils.env_checker import check_env
 
 from race.envs import make_continuous_task, make_discrete_task, make_task
-from race.envs.micro import Battle, load_map, make, map_names
+from race.envs.micro import Battle, load_map, make
 from race.envs.micro.battle import FIRST_TARGET, NORTH, STOP, WEST
 from race.envs.micro.environment import MicroEnv
 from race.errors import RenderError, TaskError
@@ -168,7 +169,7 @@ def test_misuse_is_refused(played: Battle) -> None:
         MicroEnv(played, "human")
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_sizes_are_known_before_a_map_is_built(name: str) -> None:
     spec = make_discrete_task(f"micro/{name}").spec
     shape = make(name).shape

@@ -1,5 +1,6 @@
 """Maps: where units start, maps of one's own, and what is said about broken ones."""
 
+import json
 import math
 from pathlib import Path
 from typing import Any
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
-from race.envs.micro import load_map, make, map_names
+from race.envs.micro import lattice, load_map, make, map_names, maps, opponent
 from race.envs.micro.maps import parse_map
 from race.errors import TaskError
 
@@ -97,7 +99,12 @@ SWARMS = {
     ),
 }
 # Cells that are walkable.
-OPEN = {"2c_vs_64zg": 336, "2s_vs_1sc": 896, "3s_vs_3z": 1024, "so_many_baneling": 300}
+OPEN = {
+    **{"2c_vs_64zg": 336, "2s_vs_1sc": 896, "3s_vs_3z": 1024, "so_many_baneling": 300},
+    **{"3s_vs_4z": 1024, "3s_vs_5z": 1024, "2m_vs_1z": 360, "bane_vs_bane": 360},
+    **{"6h_vs_8z": 908, "corridor": 343},
+}
+MORE_STARTS = json.loads((Path(__file__).parent / "starts.json").read_text())
 
 THREE_MARINES = """
 description = "three Marines on each side"
@@ -154,10 +161,54 @@ def test_units_start_where_the_maps_create_them(name: str) -> None:
     np.testing.assert_allclose(scenario.y, [start.y for start in starts], rtol=1e-6)
 
 
+@pytest.mark.parametrize("name", sorted(MORE_STARTS))
+def test_units_of_the_other_maps_start_where_they_are_known_to(name: str) -> None:
+    """As decoded from the maps' archives and seen in recorded battles."""
+    spec, expected = load_map(name), MORE_STARTS[name]
+    assert_same_starts(spec.allies, [tuple(start) for start in expected["allies"]])
+    assert_same_starts(spec.enemies, [tuple(start) for start in expected["enemies"]])
+
+
+def test_a_colossus_that_took_room_would_move_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual = load_map("1c3s5z").allies
+    monkeypatch.setattr(lattice, "COLOSSUS_TAKES_ROOM", True)
+    assert load_map("1c3s5z").allies != usual
+    assert load_map("3s5z").allies == make("3s5z").spec.allies
+
+
+def test_half_tiles_are_ground_or_wall_by_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    parts = csgraph_parts(load_map("corridor").cells)
+    assert parts == [343]
+    monkeypatch.setattr(maps, "HALF_TILES_ARE", "#")
+    walls = load_map("corridor")
+    assert (walls.cells == ".").sum() == 332
+    assert csgraph_parts(walls.cells) == [4, 100, 228]  # nobody would come through
+
+
+def csgraph_parts(cells: Any) -> list[int]:
+    """Sizes of the parts of the ground that hang together."""
+    labels, count = ndimage.label(cells == ".")
+    return sorted(int((labels == label).sum()) for label in range(1, count + 1))
+
+
+def test_the_enemies_of_2m_vs_1z_march_to_a_point_drawn_for_each_battle() -> None:
+    battle = make("2m_vs_1z")
+    shifts = np.array([battle.reset(jax.random.key(k))[0].units.goal_shift[0] for k in range(60)])
+    assert (np.abs(shifts[:, 0]) <= 3.0).all()
+    assert (shifts[:, 1] == 0).all()
+    assert shifts[:, 0].min() < -2 < 2 < shifts[:, 0].max()
+    assert make("3m").reset(jax.random.key(0))[0].units.goal_shift.shape == (0, 2)
+    env_state = battle.reset(jax.random.key(3))[0]
+    for shift in (-3.0, 3.0):
+        units = env_state.units._replace(goal_shift=jax.numpy.array([[shift, 0.0]]))
+        goal = opponent.march(battle.scenario, units, jax.numpy.array([-1]))
+        np.testing.assert_allclose([goal.x[0], goal.y[0]], [16.0 + shift, 12.0])
+
+
 @pytest.mark.parametrize("name", map_names())
 def test_maps_of_the_package(name: str) -> None:
     spec = load_map(name)
-    assert set(map_names()) == set(STARTS)
+    assert set(map_names()) == set(STARTS) | set(MORE_STARTS)
     assert spec.cells.shape == (32, 32)
     assert (spec.cells == ".").sum() == OPEN.get(name, 512)
     assert (spec.cells == "C").sum() == (48 if name == "2c_vs_64zg" else 0)

@@ -21,6 +21,7 @@ from race.envs.micro.units import UNIT_TYPES
 
 PER_STEP = {
     "Baneling": 1.25,
+    "Hydralisk": 1.125,
     "Colossus": 1.125,
     "Marauder": 1.125,
     "Marine": 1.125,

@@ -177,6 +177,9 @@ def test_the_nearest_is_chosen_when_the_target_dies() -> None:
     assert (film.target[died + 1 :, 6] == 2).all()
 
 
+ANTI_AIR = ("Marine", "Stalker", "Hydralisk")
+
+
 def test_reluctance_tells_threats_from_the_harmless_and_the_unreachable() -> None:
     """Of SMAC's types a Marauder and a melee unit cannot hit flyers; healers count as threats."""
     by_rank = tuple(sorted(UNIT_TYPES, key=lambda unit: UNIT_TYPES[unit].rank))
@@ -188,7 +191,7 @@ def test_reluctance_tells_threats_from_the_harmless_and_the_unreachable() -> Non
         if enemy == "Medivac":
             assert never == set(sides[0])
         else:
-            assert never == (set() if enemy in ("Marine", "Stalker") else {"Medivac"}), enemy
+            assert never == (set() if enemy in ANTI_AIR else {"Medivac"}), enemy
         assert (row[[k for unit, k in ally_of.items() if unit not in never]] == 0).all()
 
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chosen import MAPS
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from reels import (
     reel,
 )
 
-from race.envs.micro import make, map_names
+from race.envs.micro import make
 
 # What holds in every battle.
 
@@ -169,7 +170,7 @@ CHECKS = [
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 @settings(max_examples=4, derandomize=True, deadline=None, phases=[Phase.generate])
 @given(st.integers(0, 1), st.sampled_from(sorted(MANNERS)))
 def test_holds(name: str, check: Callable[[Reel], None], seed: int, manner: str) -> None:
@@ -177,7 +178,7 @@ def test_holds(name: str, check: Callable[[Reel], None], seed: int, manner: str)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 @settings(max_examples=20, derandomize=True, deadline=None, phases=[Phase.generate])
 @given(st.integers(2, 2**31), st.sampled_from(sorted(MANNERS)))
 def test_holds_at_length(name: str, seed: int, manner: str) -> None:
@@ -186,7 +187,7 @@ def test_holds_at_length(name: str, seed: int, manner: str) -> None:
         check(played)
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_battles_are_fought(name: str) -> None:
     """The battles above are no walks: units are hurt, healed and die."""
     reels = [reel(name, seed, "advance") for seed in (0, 1)]
@@ -201,7 +202,7 @@ def test_battles_are_fought(name: str) -> None:
 # Chance.
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_the_key_decides(name: str) -> None:
     first, again, other = (play(name, seed, "advance") for seed in (0, 0, 1))
     jax.tree.map(np.testing.assert_array_equal, first, again)

@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chosen import MAPS
 
 from race.cli.render import PolicyName
-from race.envs.micro import Battle, make, map_names, smac
+from race.envs.micro import Battle, make, smac
 from race.envs.micro.battle import LOOPS_PER_STEP, NORTH
 from race.envs.micro.canvas import WHITE, Canvas, Window
 from race.envs.micro.policies import POLICIES
@@ -194,7 +195,7 @@ def test_everyone_stays_in_the_picture() -> None:
     assert used(battle.spec, far).right <= window.right
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_every_unit_of_every_map_is_drawn_where_it_is(name: str) -> None:
     battle = make(name)
     window = whole(battle)

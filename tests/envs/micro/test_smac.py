@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chosen import MAPS
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from second_smac import TABLE, TYPES, Columns, Smac, blurred, later, situation
 
-from race.envs.micro import make, map_names, smac
+from race.envs.micro import make, smac
 
 _observe = jax.jit(jax.vmap(smac.observe, in_axes=(None, 0, 0)))
 _judge = jax.jit(jax.vmap(smac.judge, in_axes=(None, 0, 0, 0)))
@@ -60,7 +61,7 @@ def compare(name: str, seed: int) -> set[str]:
     return kinds
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_agrees_with_a_second_version(name: str) -> None:
     kinds: set[str] = set()
 
@@ -74,7 +75,7 @@ def test_agrees_with_a_second_version(name: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 @settings(max_examples=50, derandomize=True, deadline=None, phases=[Phase.generate])
 @given(st.integers(0, 2**32 - 1))
 def test_agrees_with_a_second_version_at_length(name: str, seed: int) -> None:
@@ -209,7 +210,7 @@ def test_an_end_in_the_last_step_is_no_time_out() -> None:
 # Shapes and steps.
 
 
-@pytest.mark.parametrize("name", map_names())
+@pytest.mark.parametrize("name", MAPS)
 def test_shapes(name: str) -> None:
     battle, table = make(name), TABLE[name]
     shape = battle.shape
