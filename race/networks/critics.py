@@ -11,11 +11,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from race.networks.dense import (
     Dense,
     PolicyEmbedding,
+    before_activation,
     embed_policy,
     head_vectors,
     init_dense,
     init_policy_embedding,
-    normalise,
     stack,
 )
 from race.types import EnvSpec
@@ -74,9 +74,9 @@ def q_values(
     x = critic.first(jnp.broadcast_to(x, (critic.first.bias.shape[0], *x.shape)))
     if shift is not None:
         x = x + shift[:, None]
-    x = jax.nn.leaky_relu(normalise(x) if critic.layer_norm else x)
+    x = jax.nn.leaky_relu(before_activation(x, critic.layer_norm))
     x = critic.hidden(x)
-    x = jax.nn.leaky_relu(normalise(x) if critic.layer_norm else x)
+    x = jax.nn.leaky_relu(before_activation(x, critic.layer_norm))
     return critic.out(x)[:, :, 0]
 
 

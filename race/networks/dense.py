@@ -50,6 +50,11 @@ def normalise(x: Float[Array, "*b h"]) -> Float[Array, "*b h"]:
     return centred * jax.lax.rsqrt(variance + VARIANCE_FLOOR)
 
 
+def before_activation(x: Float[Array, "*b h"], layer_norm: bool) -> Float[Array, "*b h"]:
+    """What goes into an activation: a layer's sums, normalised where the network says so."""
+    return normalise(x) if layer_norm else x
+
+
 def stack(trees: list[Any]) -> Any:
     """Stacks equal pytrees along a new leading axis."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)
@@ -85,8 +90,8 @@ def encode(encoder: Encoder, spec: EnvSpec, state: Float[Array, "B S"]) -> Float
     if not spec.obs_mask.all():
         obs = obs * jnp.asarray(spec.obs_mask, obs.dtype)[:, None, :]
     x = encoder.hidden(obs)
-    x = encoder.out(jnp.tanh(normalise(x) if encoder.layer_norm else x))
-    return jnp.tanh(normalise(x) if encoder.layer_norm else x)
+    x = encoder.out(jnp.tanh(before_activation(x, encoder.layer_norm)))
+    return jnp.tanh(before_activation(x, encoder.layer_norm))
 
 
 def init_head(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int) -> Float[Array, "N H1 A"]:

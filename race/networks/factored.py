@@ -20,10 +20,10 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from race.networks.dense import (
     Dense,
     PolicyEmbedding,
+    before_activation,
     embed_policy,
     init_dense,
     init_policy_embedding,
-    normalise,
 )
 
 
@@ -124,9 +124,9 @@ def utility_values(
     x = utilities.first(inputs)
     if shift is not None:
         x = x + shift[..., None, :]
-    x = jax.nn.relu(normalise(x) if utilities.layer_norm else x)
+    x = jax.nn.relu(before_activation(x, utilities.layer_norm))
     x = utilities.hidden(x)
-    x = jax.nn.relu(normalise(x) if utilities.layer_norm else x)
+    x = jax.nn.relu(before_activation(x, utilities.layer_norm))
     return utilities.out(x)[..., 0]
 
 

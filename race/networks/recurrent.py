@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from race.networks.dense import Dense, init_dense, normalise
+from race.networks.dense import Dense, before_activation, init_dense
 from race.networks.gru import Gates, gru, gru_step
 
 
@@ -69,7 +69,7 @@ def gate_inputs(
     x = both @ weight
     shift = encoder.agent + encoder.obs.bias[None]
     x = x + jnp.broadcast_to(shift, x.shape)
-    x = jax.nn.relu(normalise(x) if encoder.layer_norm else x).reshape(-1, x.shape[-1])
+    x = jax.nn.relu(before_activation(x, encoder.layer_norm)).reshape(-1, x.shape[-1])
     weights, biases = _gates(encoder.into)
     shape = (*last_action.shape, -1)
     return Gates(*((x @ w + b[None]).reshape(shape) for w, b in zip(weights, biases, strict=True)))
