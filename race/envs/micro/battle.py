@@ -84,7 +84,9 @@ def game_loop(scenario: Scenario, units: Units, given: Orders, delays: Float[Any
     """1/16 s: choose targets, attack, heal, regenerate, move."""
     shape, n = scenario.shape, scenario.shape.n_allies
     units = units._replace(
-        cooldown=jnp.maximum(units.cooldown - 1, 0.0), since_shot=units.since_shot + 1
+        cooldown=jnp.maximum(units.cooldown - 1, 0.0),
+        since_shot=units.since_shot + 1,
+        clock=units.clock + 1,
     )
     enemy_target = opponent.choose_targets(scenario, units)
     goal = opponent.march(scenario, units, enemy_target)

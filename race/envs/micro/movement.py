@@ -11,7 +11,15 @@ from race.envs.micro.state import Units
 from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
 
 SWERVE: Final = 1.0
-"""Share of a push that also turns the unit aside, so that it finds its way round others."""
+"""Share of what a blocked unit loses of its step that it takes aside instead."""
+STILL: Final = 0.1
+"""A unit that made less than this share of its step does not go round others, but stands."""
+BEAT: Final = 32
+"""Game loops after which a unit that stands tries the other side."""
+TIGHT: Final = 0.95
+"""Share of the contact distance within which nobody comes any nearer to anybody."""
+AIR_DRIFT: Final = 0.025
+"""Share of an overlap by which each of two flyers gives way in a game loop."""
 
 
 class Course(NamedTuple):
@@ -27,36 +35,41 @@ class Footing(NamedTuple):
     """How firmly units stand against others that walk into them."""
 
     fights: Bool[Any, "U"]
-    """Units in an attack yield to nobody."""
+    """Units in an attack hold their place."""
     idle: Bool[Any, "U"]
-    """Idle units yield to friends and not to enemies."""
+    """Idle units make way for friends and not for enemies."""
+
+
+class Step(NamedTuple):
+    """A game loop's step of each unit."""
+
+    x: Float[Any, "U"]
+    y: Float[Any, "U"]
 
 
 def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> Units:
-    """One game loop of walking: own steps, then others' pushes, then walls."""
+    """One game loop of walking: own steps, round others, along walls, and never into anybody.
+
+    What a step may close of a gap to another unit is half of it, all of it if the other fights,
+    and more by as much as the other draws away. Whatever exceeds this is taken off the step, and
+    turned aside instead; what is still too much shortens it.
+    """
     alive = units.health > 0
-    vx, vy = _own_step(scenario, units, course)
-    vx, vy = jnp.where(alive, vx, 0.0), jnp.where(alive, vy, 0.0)
-    push_x, push_y = _pushes(scenario, units, vx, vy, footing)
-    pushed = (push_x != 0) | (push_y != 0)
-    dx, dy = vx + push_x, vy + push_y
-    # Half of the last loop's step goes on in a crowd; without it units tremble between others.
-    dx = jnp.where(pushed, 0.5 * (dx + units.vx), dx)
-    dy = jnp.where(pushed, 0.5 * (dy + units.vy), dy)
-    length = jnp.sqrt(dx * dx + dy * dy)
-    share = jnp.where(alive, jnp.minimum(1.0, scenario.speed / jnp.maximum(length, 1e-6)), 0.0)
-    x, y = _stop_at_walls(scenario, units, units.x + dx * share, units.y + dy * share)
-    x, y = jnp.where(alive, x, units.x), jnp.where(alive, y, units.y)
-    going_x, going_y = x - units.x, y - units.y
+    own = _own_step(scenario, units, course)
+    own = Step(jnp.where(alive, own.x, 0.0), jnp.where(alive, own.y, 0.0))
+    step = _round_others(scenario, units, own, footing)
+    step = _along_walls(scenario, units, step)
+    share = jnp.where(alive, _free(scenario, units, step, footing), 0.0)
+    step = Step(step.x * share, step.y * share)
+    gone = step
     if scenario.shape.flyers:  # which slow down too gently to take a push along
-        going_x = jnp.where(scenario.flying, vx, going_x)
-        going_y = jnp.where(scenario.flying, vy, going_y)
-    return units._replace(x=x, y=y, vx=going_x, vy=going_y)
+        gone = Step(
+            jnp.where(scenario.flying, own.x, gone.x), jnp.where(scenario.flying, own.y, gone.y)
+        )
+    return units._replace(x=units.x + step.x, y=units.y + step.y, vx=gone.x, vy=gone.y)
 
 
-def _own_step(
-    scenario: Scenario, units: Units, course: Course
-) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
+def _own_step(scenario: Scenario, units: Units, course: Course) -> Step:
     x, y = _way(scenario, units, course)
     dx, dy = x - units.x, y - units.y
     length = jnp.sqrt(dx * dx + dy * dy)
@@ -72,7 +85,7 @@ def _own_step(
         change = jnp.sqrt(change_x * change_x + change_y * change_y)
         share = jnp.minimum(1.0, scenario.acceleration / jnp.maximum(change, 1e-6))
         vx, vy = units.vx + change_x * share, units.vy + change_y * share
-    return vx, vy
+    return Step(vx, vy)
 
 
 def _way(
@@ -96,59 +109,87 @@ def _way(
     )
 
 
-def _pushes(
-    scenario: Scenario,
-    units: Units,
-    vx: Float[Any, "U"],
-    vy: Float[Any, "U"],
-    footing: Footing,
-) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
-    """What undoes overlaps, shared by how firmly the two units stand.
+class _Pairs(NamedTuple):
+    """Each unit i (rows) and whom it may meet (columns)."""
 
-    Of two equally firm units each takes half; a firm one takes none and leaves all to the other.
-    """
-    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
+    x: Float[Any, "U U"]
+    """Direction from i to j, of length 1."""
+    y: Float[Any, "U U"]
+    near: Float[Any, "U U"]
+    """From contact to contact; below 0 in an overlap."""
+    meets: Float[Any, "U U"]
+    """By how much the steps of i bring it nearer to j."""
+    gives: Float[Any, "U U"]
+    """By how much the steps of j bring it away from i."""
+    room: Float[Any, "U U"]
+    """By how much i may come nearer."""
+
+
+def _pairs(
+    scenario: Scenario, units: Units, step: Step, footing: Footing, contact: float
+) -> _Pairs:
+    everyone = jnp.arange(scenario.shape.n_units)
     # The dead are put out of everyone's way.
-    x = jnp.where(units.health > 0, units.x + vx, 1000.0 + 10.0 * everyone.astype(jnp.float32))
-    y = units.y + vy
-    with_friends = jnp.where(footing.fights, 0.5, 0.0)
-    with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
+    x = jnp.where(units.health > 0, units.x, 1000.0 + 10.0 * everyone.astype(jnp.float32))
+    firm = footing.fights.astype(jnp.float32)
     # Without the barrier the compiler works these out again for every pair of units.
-    x, y, with_friends, with_enemies = jax.lax.optimization_barrier(
-        (x, y, with_friends, with_enemies)
+    x, firm, step = jax.lax.optimization_barrier((x, firm, step))
+    dx, dy = x[None] - x[:, None], units.y[None] - units.y[:, None]
+    square = jnp.maximum(dx * dx + dy * dy, 1e-4)
+    inverse = jax.lax.rsqrt(square)
+    dx, dy = dx * inverse, dy * inverse
+    near = square * inverse - contact * scenario.contact
+    gives = step.x[None] * dx + step.y[None] * dy
+    # Who did not draw away in the last loop may not do so in this one either.
+    last = units.vx[None] * dx + units.vy[None] * dy
+    share = 0.5 + 0.5 * (firm[None] - firm[:, None])
+    return _Pairs(
+        x=dx,
+        y=dy,
+        near=near,
+        meets=step.x[:, None] * dx + step.y[:, None] * dy,
+        gives=gives,
+        room=share * near + jnp.maximum(jnp.minimum(gives, last), 0.0),
     )
-    dx, dy = x[:, None] - x[None], y[:, None] - y[None]
-    # (c^2 - d^2) / 2d is the overlap c - d near contact, and more where it is deep.
-    square = jnp.maximum(dx * dx + dy * dy, 1e-3)
-    overlap = jnp.maximum(scenario.contact / square - 1.0, 0.0) * scenario.stiffness
-    side = everyone < n
-    same = side[:, None] == side[None]
-    share = 0.5 + jnp.where(
-        same,
-        with_friends[None] - with_friends[:, None],
-        with_enemies[None] - with_enemies[:, None],
-    )
-    weight = overlap * share
-    push_x, push_y = jnp.sum(weight * dx, axis=1), jnp.sum(weight * dy, axis=1)
-    turn = jnp.where(footing.fights | footing.idle, 0.0, SWERVE)
-    # On to the side on which it already goes round, or else to the one that brings it on.
-    onwards = units.vy * push_x - units.vx * push_y
-    onwards = jnp.where(onwards == 0, vy * push_x - vx * push_y, onwards)
-    turn = jnp.where(onwards >= 0, turn, -turn)
-    return push_x - turn * push_y, push_y + turn * push_x
 
 
-def _stop_at_walls(
-    scenario: Scenario, units: Units, x: Float[Any, "U"], y: Float[Any, "U"]
-) -> tuple[Float[Any, "U"], Float[Any, "U"]]:
+def _round_others(scenario: Scenario, units: Units, own: Step, footing: Footing) -> Step:
+    """Takes off a step what others leave no room for, and goes aside instead."""
+    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
+    pairs = _pairs(scenario, units, own, footing, 1.0)
+    side, idle = everyone < n, footing.idle
+    makes_way = (side[:, None] == side[None]) & (idle & ~footing.fights)[:, None] & ~idle[None]
+    wants = pairs.meets + jnp.where(makes_way, 0.5 * jnp.maximum(-pairs.gives, 0.0), 0.0)
+    excess = jnp.maximum(wants - pairs.room, 0.0)
+    if scenario.shape.flyers:
+        distance = pairs.near + scenario.contact
+        excess += AIR_DRIFT * jnp.maximum(scenario.air_contact - distance, 0.0)
+    stays = footing.fights & ~scenario.flying
+    back_x = jnp.where(stays, 0.0, -jnp.sum(excess * pairs.x, axis=1))
+    back_y = jnp.where(stays, 0.0, -jnp.sum(excess * pairs.y, axis=1))
+    turn = jnp.where(footing.fights | idle | scenario.flying, 0.0, SWERVE)
+    # On the side on which it already goes round. Who stands tries one and then the other.
+    onwards = units.vy * back_x - units.vx * back_y
+    goes = jnp.square(units.vx) + jnp.square(units.vy) > jnp.square(STILL * scenario.speed)
+    beat = (units.clock + 11 * everyone) // BEAT % 2
+    turn = jnp.where(jnp.where(goes, onwards >= 0, beat == 0), turn, -turn)
+    x, y = own.x + back_x - turn * back_y, own.y + back_y + turn * back_x
+    length = jnp.sqrt(x * x + y * y)
+    share = jnp.minimum(1.0, scenario.speed / jnp.maximum(length, 1e-6))
+    return Step(x * share, y * share)
+
+
+def _along_walls(scenario: Scenario, units: Units, step: Step) -> Step:
     """Keeps centres at their inner radius from walls, first in x, then in y.
 
     A unit that is nearer already, because it was created there, comes no nearer.
     """
+    x, y = units.x + step.x, units.y + step.y
     low_x, high_x, low_y, high_y = scenario.bounds
     if scenario.shape.plain:
         x = jnp.clip(x, jnp.minimum(low_x, units.x), jnp.maximum(high_x, units.x))
-        return x, jnp.clip(y, jnp.minimum(low_y, units.y), jnp.maximum(high_y, units.y))
+        y = jnp.clip(y, jnp.minimum(low_y, units.y), jnp.maximum(high_y, units.y))
+        return Step(x - units.x, y - units.y)
     walls, mover, inner = scenario.walls, scenario.mover, scenario.inner_radius
 
     def between(
@@ -162,7 +203,14 @@ def _stop_at_walls(
     x = between(units.x, x, (beside & WEST) > 0, (beside & EAST) > 0)
     beside = walls[mover, _cell(x), _cell(units.y)]
     y = between(units.y, y, (beside & SOUTH) > 0, (beside & NORTH) > 0)
-    return x, y
+    return Step(x - units.x, y - units.y)
+
+
+def _free(scenario: Scenario, units: Units, step: Step, footing: Footing) -> Float[Any, "U"]:
+    """The share of a step that leads too near to nobody."""
+    pairs = _pairs(scenario, units, step, footing, TIGHT)
+    needed = pairs.meets / jnp.maximum(pairs.room, 1e-6)
+    return 1.0 / jnp.maximum(jnp.max(needed, axis=1), 1.0)
 
 
 def _cell(place: Float[Any, "U"]) -> Int[Any, "U"]:

@@ -24,10 +24,8 @@ REWARD_DEATH: Final = 10.0
 REWARD_WIN: Final = 200.0
 REWARD_SCALE: Final = 20.0
 """SMAC divides rewards by the highest return over this."""
-STIFFNESS: Final = 1.0
-"""Share of an overlap that two units undo together in a game loop."""
-AIR_STIFFNESS: Final = 0.05
-"""The same for flyers, which drift apart slowly."""
+APART: Final = -1e6
+"""A contact distance of units that pass each other."""
 
 _UNARMED: Final = Weapon(damage=0.0, period=1.0, range=0.0)
 
@@ -150,9 +148,9 @@ class Scenario:
 
     # Crowding.
     contact: Float[Any, "U U"]
-    """Square of the centre distance at which two units touch; 0 if they pass each other."""
-    stiffness: Float[Any, "U U"]
-    """Half the share of an overlap that is undone in a game loop."""
+    """Centre distance at which two units on the ground touch; `APART` if they pass each other."""
+    air_contact: Float[Any, "U U"]
+    """The same where one of the two flies; there they only drift apart."""
 
     # SMAC's features.
     cooldown_scale: Float[Any, "n"]
@@ -191,7 +189,7 @@ def _build(spec: MapSpec) -> Scenario:
     ground = survey(spec.cells, tuple(sorted({t.mover for t in types})), places)
     burst_damage, burst_armour = _bursts(types, n)
     damage = _damage(types, n)
-    contact, stiffness = _contacts(types)
+    contact, air_contact = _contacts(types)
     goals = _goals(spec, places)
     structure = [0.0 if "structure" in t.attributes else 1.0 for t in types]
     return Scenario(
@@ -239,7 +237,7 @@ def _build(spec: MapSpec) -> Scenario:
         goal_y=_f(goals[n:, 1]),
         goal_spread=_spread(spec),
         contact=contact,
-        stiffness=stiffness,
+        air_contact=air_contact,
         cooldown_scale=_f(
             [
                 t.smac_cooldown or w.period * LOOPS_PER_SECOND
@@ -377,15 +375,14 @@ def _spread(spec: MapSpec) -> NDArray[np.float32]:
 
 
 def _contacts(types: list[UnitType]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    separation = np.array([t.separation for t in types])
-    contact = separation[:, None] + separation[None]
-    stiffness = np.zeros_like(contact)
+    on_the_ground = np.full((len(types), len(types)), APART)
+    in_the_air = on_the_ground.copy()
     for i, one in enumerate(types):
         for j, other in enumerate(types):
             if i != j and _collide(one, other):
-                in_the_air = Mover.AIR in (one.mover, other.mover)
-                stiffness[i, j] = AIR_STIFFNESS if in_the_air else STIFFNESS
-    return _f(np.where(stiffness > 0, np.square(contact), 0.0)), _f(stiffness / 2)
+                plane = in_the_air if Mover.AIR in (one.mover, other.mover) else on_the_ground
+                plane[i, j] = one.separation + other.separation
+    return _f(on_the_ground), _f(in_the_air)
 
 
 def _collide(one: UnitType, other: UnitType) -> bool:

@@ -48,6 +48,8 @@ class Units(NamedTuple):
     """Whether the unit has burst."""
     beam: Float[Any, "beams 4"]
     """Middle (x, y) of each beam's line and the direction (x, y) of the shot across it."""
+    clock: Int[Any, ""]
+    """Game loops since the battle began."""
     goal_shift: Float[Any, "goals 2"]
     """From the middle of where enemies may be sent to where they are sent in this battle; none on
     maps that always send them to the same point."""
@@ -94,6 +96,7 @@ def start(scenario: Scenario, key: Key[Array, ""] | None = None) -> EnvState:
         struck_by=jnp.full(shape.n_enemies, NOBODY, jnp.int32),
         burst=zeros > 0,
         beam=jnp.zeros((shape.n_beams, 4)),
+        clock=jnp.zeros((), jnp.int32),
         goal_shift=along * scenario.goal_spread,
     )
     return EnvState(
