@@ -11,7 +11,7 @@ import tyro
 from race.config.settings import TeamName
 from race.errors import ConfigError, RenderError, blamed
 
-PolicyName = Literal["scripted", "random"]
+PolicyName = Literal["scripted", "random", "nearest", "heuristic"]
 _SECONDS = 15.0
 STEPS_PER_SECOND = 2
 """Of a battle, at the game's "normal" speed."""
@@ -78,7 +78,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     if chosen.team is not None:
         raise ConfigError(
             f"--team is for runs, and {chosen.what} is a battle that no team was trained for: "
-            "leave it out, or choose --policy scripted or random."
+            "leave it out, or choose --policy scripted, random, nearest or heuristic."
         )
     if chosen.seed >= 2**32:
         raise ConfigError(f"The --seed of a battle must be below {2**32}.")

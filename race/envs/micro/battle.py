@@ -13,6 +13,8 @@ from race.envs.micro.state import NOBODY, Units
 from race.envs.micro.units import HEAL_RANGE
 
 LOOPS_PER_STEP: Final = 8
+LATEST_SIGHT: Final = 2
+"""Game loops that a battle may be old when it is first seen."""
 MOVE: Final = 2.0
 """How far a move order goes, in cells; no unit gets there within a step."""
 NO_OP, STOP, NORTH, SOUTH, EAST, WEST, FIRST_TARGET = range(7)
@@ -47,6 +49,24 @@ def orders(scenario: Scenario, units: Units, actions: Int[Any, "n"]) -> Orders:
         x=units.x[:n] + step_x,
         y=units.y[:n] + step_y,
     )
+
+
+def wait(scenario: Scenario, units: Units, key: Key[Array, ""]) -> Units:
+    """What happens before a battle is first seen: 0, 1 or 2 game loops, each as likely.
+
+    SMAC looks at the units of a new episode up to two loops after the game has made them. That
+    the three are equally likely is a choice of ours.
+    """
+    loops = jax.random.randint(key, (), 0, LATEST_SIGHT + 1)
+    stop = jnp.full(scenario.shape.n_allies, STOP)
+    given, delays = orders(scenario, units, stop), jnp.zeros(scenario.shape.n_units)
+
+    def loop(units: Units, number: Int[Any, ""]) -> tuple[Units, None]:
+        later = game_loop(scenario, units, given, delays)
+        begun = number < loops
+        return jax.tree.map(lambda new, old: jnp.where(begun, new, old), later, units), None
+
+    return jax.lax.scan(loop, units, jnp.arange(LATEST_SIGHT))[0]
 
 
 def fight(scenario: Scenario, units: Units, given: Orders, key: Key[Array, ""]) -> Units:

@@ -1,5 +1,6 @@
 """How units walk, keep apart and stay on their ground."""
 
+import math
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -13,10 +14,14 @@ from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
 SWERVE: Final = 1.0
 """Share of what a blocked unit loses of its step that it takes aside instead."""
 STILL: Final = 0.1
-"""A unit that made less than this share of its step does not go round others, but stands."""
-BEAT: Final = 32
-"""Game loops after which a unit that stands tries the other side."""
-TIGHT: Final = 0.95
+"""A unit that makes less than this share of its step in a game loop is stuck."""
+CARRY: Final = 0.3
+"""Share of the last loop's step that goes on in a crowd, where units else tremble."""
+DETOUR: Final = 12.0
+"""Game loops for which a unit that was stuck goes round, before it heads for its goal again."""
+DETOUR_TURN: Final = math.radians(100.0)
+"""How far aside: a little backwards, out of the notch between two others."""
+TIGHT: Final = 0.97
 """Share of the contact distance within which nobody comes any nearer to anybody."""
 AIR_DRIFT: Final = 0.025
 """Share of an overlap by which each of two flyers gives way in a game loop."""
@@ -57,6 +62,7 @@ def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> 
     alive = units.health > 0
     own = _own_step(scenario, units, course)
     own = Step(jnp.where(alive, own.x, 0.0), jnp.where(alive, own.y, 0.0))
+    own = _detour(scenario, units, own)
     step = _round_others(scenario, units, own, footing)
     step = _along_walls(scenario, units, step)
     share = jnp.where(alive, _free(scenario, units, step, footing), 0.0)
@@ -66,7 +72,13 @@ def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> 
         gone = Step(
             jnp.where(scenario.flying, own.x, gone.x), jnp.where(scenario.flying, own.y, gone.y)
         )
-    return units._replace(x=units.x + step.x, y=units.y + step.y, vx=gone.x, vy=gone.y)
+    return units._replace(
+        x=units.x + step.x,
+        y=units.y + step.y,
+        vx=gone.x,
+        vy=gone.y,
+        detour=_next_detour(scenario, units, own, step, footing),
+    )
 
 
 def _own_step(scenario: Scenario, units: Units, course: Course) -> Step:
@@ -109,6 +121,33 @@ def _way(
     )
 
 
+def _detour(scenario: Scenario, units: Units, own: Step) -> Step:
+    """The steps of those who go round, turned to their side."""
+    side = jnp.sign(units.detour)
+    ahead = jnp.where(side == 0, 1.0, math.cos(DETOUR_TURN))
+    aside = math.sin(DETOUR_TURN) * side
+    return Step(ahead * own.x - aside * own.y, ahead * own.y + aside * own.x)
+
+
+def _next_detour(
+    scenario: Scenario, units: Units, own: Step, step: Step, footing: Footing
+) -> Float[Any, "U"]:
+    """Game loops that are left of each unit's detour, below 0 to the right.
+
+    Who is stuck begins one to the side that its number says, and on a detour turns to the other.
+    """
+    length = jnp.square(step.x) + jnp.square(step.y)
+    stuck = length < jnp.square(STILL) * (jnp.square(own.x) + jnp.square(own.y))
+    stuck &= ~footing.fights & ~footing.idle
+    if scenario.shape.flyers:
+        stuck &= ~scenario.flying
+    left = jnp.sign(units.detour) * jnp.maximum(jnp.abs(units.detour) - 1.0, 0.0)
+    left = jnp.where(footing.fights | footing.idle, 0.0, left)
+    first = jnp.where(jnp.arange(scenario.shape.n_units) % 2 == 0, DETOUR, -DETOUR)
+    other = jnp.where(units.detour == 0, first, -jnp.sign(units.detour) * DETOUR)
+    return jnp.where(stuck, other, left)
+
+
 class _Pairs(NamedTuple):
     """Each unit i (rows) and whom it may meet (columns)."""
 
@@ -128,12 +167,15 @@ class _Pairs(NamedTuple):
 def _pairs(
     scenario: Scenario, units: Units, step: Step, footing: Footing, contact: float
 ) -> _Pairs:
-    everyone = jnp.arange(scenario.shape.n_units)
+    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
     # The dead are put out of everyone's way.
     x = jnp.where(units.health > 0, units.x, 1000.0 + 10.0 * everyone.astype(jnp.float32))
-    firm = footing.fights.astype(jnp.float32)
+    with_friends = jnp.where(footing.fights, 0.5, 0.0)
+    with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
     # Without the barrier the compiler works these out again for every pair of units.
-    x, firm, step = jax.lax.optimization_barrier((x, firm, step))
+    x, with_friends, with_enemies, step = jax.lax.optimization_barrier(
+        (x, with_friends, with_enemies, step)
+    )
     dx, dy = x[None] - x[:, None], units.y[None] - units.y[:, None]
     square = jnp.maximum(dx * dx + dy * dy, 1e-4)
     inverse = jax.lax.rsqrt(square)
@@ -142,7 +184,13 @@ def _pairs(
     gives = step.x[None] * dx + step.y[None] * dy
     # Who did not draw away in the last loop may not do so in this one either.
     last = units.vx[None] * dx + units.vy[None] * dy
-    share = 0.5 + 0.5 * (firm[None] - firm[:, None])
+    side = everyone < n
+    firmer = jnp.where(
+        side[:, None] == side[None],
+        with_friends[None] - with_friends[:, None],
+        with_enemies[None] - with_enemies[:, None],
+    )
+    share = 0.5 + jnp.where(near > 0, jnp.maximum(firmer, 0.0), firmer)
     return _Pairs(
         x=dx,
         y=dy,
@@ -168,12 +216,14 @@ def _round_others(scenario: Scenario, units: Units, own: Step, footing: Footing)
     back_x = jnp.where(stays, 0.0, -jnp.sum(excess * pairs.x, axis=1))
     back_y = jnp.where(stays, 0.0, -jnp.sum(excess * pairs.y, axis=1))
     turn = jnp.where(footing.fights | idle | scenario.flying, 0.0, SWERVE)
-    # On the side on which it already goes round. Who stands tries one and then the other.
+    # On the side on which it already goes round.
     onwards = units.vy * back_x - units.vx * back_y
-    goes = jnp.square(units.vx) + jnp.square(units.vy) > jnp.square(STILL * scenario.speed)
-    beat = (units.clock + 11 * everyone) // BEAT % 2
-    turn = jnp.where(jnp.where(goes, onwards >= 0, beat == 0), turn, -turn)
+    turn = jnp.where(onwards >= 0, turn, -turn)
     x, y = own.x + back_x - turn * back_y, own.y + back_y + turn * back_x
+    goes = jnp.square(units.vx) + jnp.square(units.vy) > jnp.square(STILL * scenario.speed)
+    crowded = ((back_x != 0) | (back_y != 0)) & goes & ~scenario.flying
+    x = jnp.where(crowded, (1 - CARRY) * x + CARRY * units.vx, x)
+    y = jnp.where(crowded, (1 - CARRY) * y + CARRY * units.vy, y)
     length = jnp.sqrt(x * x + y * y)
     share = jnp.minimum(1.0, scenario.speed / jnp.maximum(length, 1e-6))
     return Step(x * share, y * share)

@@ -51,7 +51,11 @@ def answer_calls(scenario: Scenario, units: Units) -> Units:
 
 
 def choose_targets(scenario: Scenario, units: Units) -> Int[Any, "m"]:
-    """The ally that each enemy attacks, or `NOBODY`. Healers attack nobody."""
+    """The ally that each enemy attacks, or `NOBODY`. Healers attack nobody.
+
+    Enemies choose once in ``scenario.scan_period`` game loops. In between they stay with their
+    choice, and stand where their target has died.
+    """
     n = scenario.shape.n_allies
     alive = units.health[:n] > 0
     current = units.target[n:]
@@ -75,7 +79,10 @@ def choose_targets(scenario: Scenario, units: Units) -> Int[Any, "m"]:
     attacker = units.struck_by
     answers = still(attacker) & jnp.isfinite(scenario.reluctance[rows, attacker])
     other = jnp.where(chased, current, jnp.where(answers, attacker, NOBODY))
-    return jnp.where(found, nearest, other)
+    period = scenario.scan_period
+    phase = jnp.floor(period.astype(jnp.float32) * units.scan_phase).astype(period.dtype)
+    looks = (units.clock + phase) % period == 0
+    return jnp.where(looks, jnp.where(found, nearest, other), current)
 
 
 def choose_patients(scenario: Scenario, units: Units) -> Int[Any, "healers"]:

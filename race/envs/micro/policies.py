@@ -1,7 +1,7 @@
 """Yardsticks: what a team does that has learned nothing."""
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,16 @@ from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import EnvState
 from race.types import Observation
 
-Policy = Callable[[Scenario, EnvState, Observation, Key[Array, ""]], Int[Any, "n"]]
+Choose = Callable[[Scenario, EnvState, Observation, Key[Array, ""]], Int[Any, "n"]]
+
+
+class Policy(NamedTuple):
+    """A way to play for a whole team that needs no memory but the state."""
+
+    choose: Choose
+    """The agents' actions [n], from the map, the state, what the agents see, and a key."""
+    any_distance: bool = False
+    """Whether its orders to attack or heal hold past SMAC's mask (`smac.step`)."""
 
 
 def random_actions(
@@ -56,7 +65,58 @@ def focus_fire(
     return jnp.where(alive[:n], choice, battle.NO_OP).astype(jnp.int32)
 
 
-POLICIES: Final[dict[str, Policy]] = {"random": random_actions, "scripted": focus_fire}
+def nearest(
+    scenario: Scenario, env_state: EnvState, observation: Observation, key: Key[Array, ""]
+) -> Int[Any, "n"]:
+    """The enemies' own rule, as far as SMAC's actions allow it.
+
+    Everyone stays with its target while that is in reach of its weapon, else attacks the nearest
+    enemy that it may, or walks towards the nearest. Healers do as in `focus_fire`.
+    """
+    n, units = scenario.shape.n_allies, env_state.units
+    dx, dy = units.x[None, n:] - units.x[:n, None], units.y[None, n:] - units.y[:n, None]
+    distance = jnp.hypot(dx, dy)
+    reach = scenario.range[:n, None] + scenario.radius[:n, None] + scenario.radius[None, n:]
+    kept = units.target[:n, None] == jnp.arange(n, scenario.shape.n_units)[None]
+    distance = jnp.where(kept & (distance <= reach), -1.0, distance)
+    hurts = (scenario.damage + scenario.burst_damage)[:n, n:] > 0
+    offered = observation.avail_actions[:, battle.FIRST_TARGET :] & hurts
+    distance = jnp.where(offered, distance, jnp.inf)
+    found = jnp.any(offered, axis=1) & ~scenario.healing_columns
+    attack = battle.FIRST_TARGET + jnp.argmin(distance, axis=1)
+    otherwise = focus_fire(scenario, env_state, observation, key)
+    return jnp.where(found, attack, otherwise).astype(jnp.int32)
+
+
+def heuristic(
+    scenario: Scenario, env_state: EnvState, observation: Observation, key: Key[Array, ""]
+) -> Int[Any, "n"]:
+    """SMAC's heuristic mode: everyone attacks the enemy that was nearest until it is dead.
+
+    Wherever that enemy is: the orders hold at any distance. Healers stay with the nearest agent
+    that is hurt until it is whole or dead, and stop if there is none.
+    """
+    del observation, key
+    n, units = scenario.shape.n_allies, env_state.units
+    everyone, alive = jnp.arange(scenario.shape.n_units), units.health > 0
+    dx, dy = units.x[None] - units.x[:n, None], units.y[None] - units.y[:n, None]
+    healers = scenario.healing_columns[:, None]
+    hurt = alive & (units.health < scenario.max_health) & (everyone < n) & ~_heals(scenario)
+    wanted = jnp.where(healers, hurt[None], (alive & (everyone >= n))[None])
+    kept = (units.target[:n, None] == everyone[None]) & wanted
+    distance = jnp.where(wanted, jnp.where(kept, -1.0, jnp.hypot(dx, dy)), jnp.inf)
+    target = jnp.argmin(distance, axis=1)
+    action = battle.FIRST_TARGET + jnp.where(scenario.healing_columns, target, target - n)
+    action = jnp.where(jnp.any(wanted, axis=1), action, battle.STOP)
+    return jnp.where(alive[:n], action, battle.NO_OP).astype(jnp.int32)
+
+
+POLICIES: Final[dict[str, Policy]] = {
+    "random": Policy(random_actions),
+    "scripted": Policy(focus_fire),
+    "nearest": Policy(nearest),
+    "heuristic": Policy(heuristic, any_distance=True),
+}
 """By the names of the command line."""
 
 

@@ -33,14 +33,19 @@ Turn = tuple[Timestep, Units]
 
 
 def step_and_film(
-    scenario: Scenario, env_state: EnvState, actions: Int[Any, "n"], key: Key[Array, ""]
+    scenario: Scenario,
+    env_state: EnvState,
+    actions: Int[Any, "n"],
+    key: Key[Array, ""],
+    *,
+    any_distance: bool = False,
 ) -> tuple[EnvState, Timestep, Units]:
     """`race.envs.micro.smac.step`, and the units after each of its eight game loops.
 
     The film shows the actions that were taken, not those that were refused. After the end of a
     battle nothing moves.
     """
-    after, timestep = smac.step(scenario, env_state, actions, key)
+    after, timestep = smac.step(scenario, env_state, actions, key, any_distance=any_distance)
     given = battle.orders(scenario, env_state.units, after.last_actions)
     film = battle.film(scenario, env_state.units, given, key)
 
@@ -123,8 +128,8 @@ def _play_step(
     key: Key[Array, ""],
 ) -> tuple[EnvState, Timestep, Units]:
     mind, world = jax.random.split(key)
-    actions = policy(scenario, env_state, observation, mind)
-    return step_and_film(scenario, env_state, actions, world)
+    actions = policy.choose(scenario, env_state, observation, mind)
+    return step_and_film(scenario, env_state, actions, world, any_distance=policy.any_distance)
 
 
 def verdict_of(scenario: Scenario, info: Info) -> str:

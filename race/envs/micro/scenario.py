@@ -20,6 +20,12 @@ from race.envs.micro.units import GROUND, LOOPS_PER_SECOND, UNIT_TYPES, Mover, U
 
 SCAN_RANGE: Final = 5.0
 """How near, edge to edge, an ally must come before an enemy with a shorter weapon attacks it."""
+SCAN_PERIOD: Final = 8
+"""Game loops between two looks of an enemy for a target; every enemy looks at moments of its own,
+drawn for each battle.
+
+How often units look is not documented. At half a second, which is how often agents may choose,
+the enemy's own rule played by the agents wins about half of even fights (docs/micro.md)."""
 REWARD_DEATH: Final = 10.0
 REWARD_WIN: Final = 200.0
 REWARD_SCALE: Final = 20.0
@@ -135,6 +141,8 @@ class Scenario:
     # The opponent.
     scan: Float[Any, "m n"]
     """Square of the centre distance within which enemies find targets."""
+    scan_period: Int[Any, ""]
+    """Game loops between two looks of an enemy for a target."""
     reach: Float[Any, "m n"]
     """Square of the centre distance at which enemies hit allies."""
     reluctance: Float[Any, "m n"]
@@ -231,6 +239,7 @@ def _build(spec: MapSpec) -> Scenario:
         burst_damage=burst_damage,
         burst_armour=burst_armour,
         scan=_reach(types, n, np.inf if spec.enemy_order.kind == "attack_nearest" else SCAN_RANGE),
+        scan_period=np.array(SCAN_PERIOD, np.int32),
         reach=_reach(types, n, 0.0),
         reluctance=_reluctance(types, n, damage),
         goal_x=_f(goals[n:, 0]),

@@ -64,19 +64,38 @@ def view(units: Units) -> View:
 
 
 def reset(scenario: Scenario, key: Key[Array, ""]) -> tuple[EnvState, Observation]:
-    """A new battle. Where units start is the same for every key, as in SMAC's maps."""
-    env_state = start(scenario, key)
+    """A new battle.
+
+    Units start at the same places for every key, as in SMAC's maps; the battle is 0, 1 or 2 game
+    loops old when it is first seen (`battle.wait`).
+    """
+    place, delay = jax.random.split(key)
+    env_state = start(scenario, place)
+    env_state = env_state._replace(units=battle.wait(scenario, env_state.units, delay))
     return env_state, observe(scenario, view(env_state.units), env_state.last_actions)
 
 
 def step(
-    scenario: Scenario, env_state: EnvState, actions: Int[Any, "n"], key: Key[Array, ""]
+    scenario: Scenario,
+    env_state: EnvState,
+    actions: Int[Any, "n"],
+    key: Key[Array, ""],
+    *,
+    any_distance: bool = False,
 ) -> tuple[EnvState, Timestep]:
     """Half a second of battle under the agents' actions.
 
     An action that is not available is refused: the agent stops instead, or does nothing if it is
     dead, and ``info.refused`` tells. (SMAC ends the program.) After the end of a battle nothing
     changes any more and the reward is 0.
+
+    Args:
+        scenario: the map.
+        env_state: the state before the step.
+        actions: of the agents, which choose among the available ones.
+        key: of the weapons' random delays.
+        any_distance: obey orders to attack or heal whatever the distance, as SMAC's heuristic
+            mode gives them past the mask.
     """
     before = view(env_state.units)
     available = avail_actions(scenario, before)
@@ -84,6 +103,8 @@ def step(
     legal = (actions >= 0) & (actions < scenario.shape.n_actions)
     legal &= available[rows, jnp.clip(actions, 0, scenario.shape.n_actions - 1)]
     alive = before.health[: scenario.shape.n_allies] > 0
+    if any_distance:
+        legal |= alive & (actions >= battle.FIRST_TARGET)
     instead = jnp.where(alive, battle.STOP, battle.NO_OP)
     taken = jnp.where(legal, actions, instead).astype(env_state.last_actions.dtype)
     given = battle.orders(scenario, env_state.units, taken)

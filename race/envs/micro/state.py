@@ -25,6 +25,8 @@ class Units(NamedTuple):
     vx: Float[Any, "U"]
     """Velocity: the step of the last game loop."""
     vy: Float[Any, "U"]
+    detour: Float[Any, "U"]
+    """Game loops for which it still goes round others to its left (to its right if below 0)."""
     health: Float[Any, "U"]
     shield: Float[Any, "U"]
     energy: Float[Any, "U"]
@@ -48,6 +50,8 @@ class Units(NamedTuple):
     """Whether the unit has burst."""
     beam: Float[Any, "beams 4"]
     """Middle (x, y) of each beam's line and the direction (x, y) of the shot across it."""
+    scan_phase: Float[Any, "m"]
+    """When in the course of a period an enemy looks for targets, from 0 to 1."""
     clock: Int[Any, ""]
     """Game loops since the battle began."""
     goal_shift: Float[Any, "goals 2"]
@@ -71,11 +75,16 @@ def start(scenario: Scenario, key: Key[Array, ""] | None = None) -> EnvState:
 
     Args:
         scenario: the map.
-        key: of what maps leave to chance, the enemies' point of attack on 2m_vs_1z. None: the
-            middle.
+        key: of what is left to chance: when each enemy looks for targets, and the enemies' point
+            of attack on 2m_vs_1z. None: evenly spread, and the middle.
     """
     shape = scenario.shape
-    along = jnp.zeros(()) if key is None else jax.random.uniform(key, minval=-1.0)
+    along = jnp.zeros(())
+    phase = jnp.arange(shape.n_enemies) / shape.n_enemies
+    if key is not None:
+        place, looks = jax.random.split(key)
+        along = jax.random.uniform(place, minval=-1.0)
+        phase = jax.random.uniform(looks, (shape.n_enemies,))
     zeros = jnp.zeros(shape.n_units)
     nobody = jnp.full(shape.n_units, NOBODY, jnp.int32)
     units = Units(
@@ -83,6 +92,7 @@ def start(scenario: Scenario, key: Key[Array, ""] | None = None) -> EnvState:
         y=scenario.y,
         vx=zeros,
         vy=zeros,
+        detour=zeros,
         health=scenario.max_health,
         shield=scenario.max_shield,
         energy=zeros.at[scenario.healers].set(START_ENERGY),
@@ -96,6 +106,7 @@ def start(scenario: Scenario, key: Key[Array, ""] | None = None) -> EnvState:
         struck_by=jnp.full(shape.n_enemies, NOBODY, jnp.int32),
         burst=zeros > 0,
         beam=jnp.zeros((shape.n_beams, 4)),
+        scan_phase=phase.astype(jnp.float32),
         clock=jnp.zeros((), jnp.int32),
         goal_shift=along * scenario.goal_spread,
     )

@@ -2,7 +2,7 @@
 
     python -m race.envs.micro.tournament [--battles 1000] [MAP ...]
 
-prints how often the random and the scripted policy win on each map.
+prints how often each policy wins on each map.
 """
 
 import argparse
@@ -45,8 +45,10 @@ def _play(policy: Policy, battles: int, scenario: Scenario, key: Key[Array, ""])
         def step(carry: Any) -> Any:
             env_state, observation, key, results = carry
             key, act_key, step_key = jax.random.split(key, 3)
-            actions = policy(scenario, env_state, observation, act_key)
-            env_state, timestep = smac.step(scenario, env_state, actions, step_key)
+            actions = policy.choose(scenario, env_state, observation, act_key)
+            env_state, timestep = smac.step(
+                scenario, env_state, actions, step_key, any_distance=policy.any_distance
+            )
             results = Results(
                 won=timestep.info.battle_won,
                 timed_out=timestep.info.timed_out,
@@ -68,7 +70,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Plays the battles and prints a table; returns the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m race.envs.micro.tournament",
-        description="How often the random and the scripted policy win.",
+        description="How often policies win that have learned nothing.",
     )
     parser.add_argument("maps", nargs="*", metavar="MAP", help="all maps, if none is named")
     parser.add_argument("--battles", type=int, default=1000, help="per map and policy (1000)")

@@ -25,7 +25,7 @@ from race.envs.micro.battle import (
     game_loop,
 )
 from race.envs.micro.maps import load_map, parse_map
-from race.envs.micro.scenario import Scenario, build
+from race.envs.micro.scenario import APART, Scenario, build
 from race.envs.micro.state import NOBODY, EnvState, Units, start
 from race.envs.micro.units import LOOPS_PER_SECOND, UNIT_TYPES
 
@@ -124,7 +124,8 @@ def battle_of(allies: list[tuple[str, int]], enemies: list[tuple[str, int]], **c
         text += f'[[{side}]]\nunit = "{unit}"\ncount = {count}\nat = [16.0, {4.0 + 8 * k}]\n'
     scenario = build(parse_map("test", text))
     changes = {name: jnp.asarray(value, jnp.float32) for name, value in changes.items()}
-    return dataclasses.replace(scenario, **changes)
+    # Rules are tested with enemies that look for targets all the time.
+    return dataclasses.replace(scenario, scan_period=jnp.array(1), **changes)
 
 
 def placed(scenario: Scenario, places: Points, **changes: Any) -> Units:
@@ -267,10 +268,10 @@ def test_banelings_needed(target: str) -> None:
 def test_five_bursts_kill_any_number_of_zealots_in_reach() -> None:
     scenario = battle_of([("Zealot", 7)], [("Baneling", 5)])
     disc = [(16.0, 16.0)] + [
-        (16 + 0.8 * math.cos(k * math.pi / 3), 16 + 0.8 * math.sin(k * math.pi / 3))
+        (16 + 0.75 * math.cos(k * math.pi / 3), 16 + 0.75 * math.sin(k * math.pi / 3))
         for k in range(6)
     ]
-    attackers = [(17.9, 15.2 + 0.4 * k) for k in range(5)]
+    attackers = [(17.9 + 0.8 * k, 16.0) for k in range(5)]
     units = placed(scenario, disc + attackers)
     units, _ = play(scenario, units, standing(7), 60)
     assert not np.asarray(units.health > 0).any()
@@ -293,7 +294,7 @@ def test_a_colossus_strikes_everyone_on_its_line_and_nobody_else() -> None:
     along = [0.0, 0.75, 1.5, 1.77, 1.79, -1.5, -1.9]
     lings = [(21.0, 16.0 + offset) for offset in along] + [(21.6, 16.0)]
     scenario = dataclasses.replace(
-        scenario, speed=jnp.zeros(9), stiffness=jnp.zeros_like(scenario.stiffness)
+        scenario, speed=jnp.zeros(9), contact=jnp.full_like(scenario.contact, APART)
     )
     units = placed(scenario, [(16.0, 16.0), *lings])
     units, film = play(scenario, units, jnp.array([1.0]), 20)

@@ -168,7 +168,7 @@ def test_fighters_are_not_moved_by_those_who_push_them() -> None:
     film = watch(scenario, units, 8, given)
     assert film.cooldown[1:, [2, 4]].max(0).min() > 0
     pushes = np.minimum(apart(film, 2, 0) - 1.0, apart(film, 2, 3) - 0.75)
-    assert pushes.min() < 0.01  # they did come against it
+    assert pushes.min() < 0.02  # they did come against it
     assert not moved(film, 2)
     assert not moved(film, 4)
     # And the pushers got past.
@@ -270,7 +270,7 @@ def siege() -> Any:
     text += '[[enemies]]\nunit = "Zealot"\ncount = 12\nat = [18.0, 16.0]\n'
     scenario = build(parse_map("siege", text))
     scenario = dataclasses.replace(scenario, damage=jnp.zeros_like(scenario.damage))
-    return watch(scenario, start(scenario).units, 16)
+    return watch(scenario, start(scenario).units, 30)
 
 
 def test_a_crowd_surrounds_its_target() -> None:
@@ -279,14 +279,14 @@ def test_a_crowd_surrounds_its_target() -> None:
     fought = film.cooldown[: six + 1, 1:].max(0) > 0
     assert fought.sum() >= 6
     # All come to fight in the end, from all sides.
-    assert (film.cooldown[:, 1:].max(0) > 0).sum() >= 10
+    assert (film.cooldown[:, 1:].max(0) > 0).all()
     around = np.sort(np.arctan2(film.y[-1, 1:] - 16, film.x[-1, 1:] - 10))
     assert np.diff([*around, around[0] + 2 * math.pi]).max() < math.pi / 2
     one, other = np.triu_indices(12, 1)
     gaps = np.hypot(
         film.x[-1, 1 + one] - film.x[-1, 1 + other], film.y[-1, 1 + one] - film.y[-1, 1 + other]
     )
-    assert gaps.min() > 2 * ZEALOT_RADIUS - 0.1
+    assert gaps.min() > 0.94 * 2 * ZEALOT_RADIUS
 
 
 def test_nobody_in_a_crowd_trembles() -> None:

@@ -42,7 +42,8 @@ def arena(sides: Sides, order: str = 'kind = "hold"', terrain: str = "") -> Scen
     for side, units, y in (("allies", sides[0], 10.0), ("enemies", sides[1], 20.0)):
         for k, unit in enumerate(units):
             text += f'[[{side}]]\nunit = "{unit}"\ncount = 1\nat = [{20.0 + 2 * k}, {y}]\n'
-    return build(parse_map("test", text))
+    # Rules are tested with enemies that look all the time.
+    return dataclasses.replace(build(parse_map("test", text)), scan_period=jnp.array(1))
 
 
 def harmless(scenario: Scenario) -> Scenario:
@@ -333,7 +334,8 @@ def test_marching_enemies_keep_their_lattice_until_contact(
     strain = np.abs(offsets - offsets[:1]).max((1, 2))
     meets = (film.target[:, 4:] >= 0).any(1)
     contact = int(np.argmax(meets)) if ally else len(meets)
-    assert (strain[:contact] < 1e-3).all()
+    # Those behind others start a little later.
+    assert (strain[:contact] < 0.01).all()
     if ally:
         assert contact > 20
         assert strain[-1] > 0.3
@@ -343,7 +345,7 @@ def test_marching_enemies_keep_their_lattice_until_contact(
         steps = np.linalg.norm(np.diff(at, axis=0), axis=-1)
         way = float(np.hypot(*(goal - lattice)[0]))
         arrival = way / 2.25 * 16
-        np.testing.assert_allclose(steps[: int(arrival) - 1], 2.25 / 16, atol=1e-4)
+        np.testing.assert_allclose(steps[1 : int(arrival) - 1], 2.25 / 16, atol=1e-4)
         np.testing.assert_allclose(at[-1], goal, atol=1e-3)
         assert steps[math.ceil(arrival) + 1 :].max() < 1e-4
 

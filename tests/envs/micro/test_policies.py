@@ -23,7 +23,7 @@ from race.envs.micro.battle import (
     fight,
     orders,
 )
-from race.envs.micro.policies import Policy, focus_fire, random_actions
+from race.envs.micro.policies import POLICIES, Choose, focus_fire, random_actions
 from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import EnvState, Units, start
 from race.types import Observation
@@ -331,7 +331,7 @@ def test_the_medivac_and_a_marauder_walk_to_whom_they_can_serve() -> None:
 _random = jax.jit(random_actions)
 
 
-def by_hand(battle: Battle, policy: Policy, key: Any) -> tuple[bool, bool, float, int]:
+def by_hand(battle: Battle, policy: Choose, key: Any) -> tuple[bool, bool, float, int]:
     """One battle of a tournament, step after step."""
     env_state, seen = battle.reset(key)
     total, length = 0.0, 0
@@ -391,7 +391,7 @@ def test_tournaments_agree_with_battles_stepped_by_hand(
 ) -> None:
     battle = {"plain": lambda: make(NAME), "hurried": hurried, "easy": easy}[kind]()
     key = jax.random.key(11)
-    results = tournament.play(battle, random_actions, key, 3)
+    results = tournament.play(battle, POLICIES["random"], key, 3)
     assert all(isinstance(leaf, np.ndarray) and leaf.shape == (3,) for leaf in results)
     assert_same(rows(results), [by_hand(battle, _random, k) for k in jax.random.split(key, 3)])
     assert (results.won == won).all()
@@ -407,9 +407,9 @@ def test_tournaments_agree_with_battles_stepped_by_hand(
 
 def test_results_do_not_depend_on_the_battles_beside() -> None:
     battle, key = make(NAME), jax.random.key(11)
-    three = tournament.play(battle, random_actions, key, 3)
+    three = tournament.play(battle, POLICIES["random"], key, 3)
     assert len({row[2:] for row in rows(three)}) == 3
-    five = tournament.play(battle, random_actions, key, 5)
+    five = tournament.play(battle, POLICIES["random"], key, 5)
     assert_same(rows(three), rows(five)[:3])
-    assert rows(three) == rows(tournament.play(battle, random_actions, key, 3))
-    assert rows(three) != rows(tournament.play(battle, random_actions, jax.random.key(12), 3))
+    assert rows(three) == rows(tournament.play(battle, POLICIES["random"], key, 3))
+    assert rows(three) != rows(tournament.play(battle, POLICIES["random"], jax.random.key(12), 3))

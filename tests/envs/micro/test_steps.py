@@ -172,7 +172,7 @@ def test_shields_come_back_after_ten_seconds() -> None:
         env_state, _ = env.step(env_state, np.ones(2, np.int32), jax.random.key(k))
         shields.append(float(env_state.units.shield[0]))
     assert shields[18] == 10
-    assert shields[19] <= 10.125
+    assert shields[19] <= 10.25  # the battle may be two game loops old when it begins
     np.testing.assert_allclose(np.diff(shields[20:]), 1.0, atol=1e-4)
 
 
