@@ -559,3 +559,36 @@ def test_targets_are_always_living_units_of_the_right_side(sides: Sides, order: 
         if not friends and "nearest" in order and sides is PROTOSS:
             # Nobody idles while somebody is left to fight.
             assert ((target != NOBODY) == (health[:, :n] > 0).any(1)).all()
+
+
+# When they look.
+
+
+def test_enemies_look_once_in_a_period_each_at_a_moment_of_its_own() -> None:
+    scenario = dataclasses.replace(arena(ZEALOTS), scan_period=jnp.array(8))
+    units = present(
+        scenario, {0: (16.0, 16.0), **{4 + k: (18.5, 14.5 + k) for k in range(4)}}
+    )._replace(scan_phase=jnp.array([0.0, 0.25, 0.5, 0.99]))
+    film = watch(scenario, units, 1)
+    first = np.argmax(film.target[:, 4:] == 0, axis=0)
+    # In loop k the clock shows k; who looks has phase (8 - k) mod 8.
+    np.testing.assert_array_equal(first, [8, 6, 4, 1])
+
+
+def test_who_lost_its_target_stands_until_it_looks_again() -> None:
+    scenario = dataclasses.replace(
+        arena(ZEALOTS, 'kind = "attack_move"\nto = [8.0, 20.0]'), scan_period=jnp.array(8)
+    )
+    units = present(scenario, {0: (16.0, 16.0), 1: (12.0, 16.0), 4: (16.9, 16.0)})
+    units = units._replace(
+        target=units.target.at[4].set(0),
+        health=units.health.at[0].set(0.0),
+        scan_phase=jnp.full(4, 0.25),
+        clock=jnp.array(0),
+    )
+    film = watch(scenario, units, 1)
+    # Six loops pass before it looks.
+    np.testing.assert_array_equal(film.target[1:6, 4], 0)
+    np.testing.assert_allclose(film.x[:6, 4], 16.9)
+    assert film.target[6, 4] == 1
+    assert film.x[-1, 4] < 16.9

@@ -301,3 +301,16 @@ def test_maps_with_walls_share_a_program_too(tmp_path: Path) -> None:
         assert env.shape.width == 14
         assert not env.shape.plain
     assert len(compilations) == 1
+
+
+def test_a_battle_is_up_to_two_loops_old_when_it_is_first_seen() -> None:
+    env = make("3m")
+    keys = jax.random.split(jax.random.key(0), 600)
+    units = jax.vmap(lambda key: env.reset(key)[0].units)(keys)
+    ages = np.asarray(units.clock)
+    assert set(ages.tolist()) == {0, 1, 2}
+    # A third each; three standard deviations of 600 draws.
+    assert (np.abs(np.bincount(ages) / 600 - 1 / 3) < 0.058).all()
+    marched = (np.asarray(env.scenario.x)[3:] - np.asarray(units.x)[:, 3:]).max(1)
+    np.testing.assert_allclose(marched, ages * 2.25 / 16, atol=0.03)
+    np.testing.assert_array_equal(units.x[:, :3], np.tile(env.scenario.x[:3], (600, 1)))
