@@ -83,8 +83,8 @@ def kernels_in(hlo: str) -> Counter[str]:
                 found += _times(count(instruction.names("body")), turns)
                 found += _times(count(instruction.names("condition")), turns + 1)
             case "conditional":
-                branches = [count(name) for name in _branches(instruction)]
-                found += max(branches, key=lambda counts: counts.total())
+                largest = max(map(count, _branches(instruction)), key=lambda each: each.total())
+                found += largest
             case "call":
                 return count(instruction.names("to_apply"))
             case opcode if opcode in _FREE or instruction.empty or opcode.endswith("-done"):
