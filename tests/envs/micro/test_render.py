@@ -12,7 +12,7 @@ import pytest
 from chosen import MAPS
 
 from race.cli.render import PolicyName
-from race.envs.micro import Battle, colors, ground, load_map, make, map_names, smac
+from race.envs.micro import Battle, colors, ground, load_map, make, map_names, smac, state
 from race.envs.micro.battle import LOOPS_PER_STEP, NORTH
 from race.envs.micro.canvas import LARGE, SMALL, Pen, View, Window, fit, line, stamp
 from race.envs.micro.legend import Legend, Standing, is_short
@@ -35,7 +35,7 @@ def recorded(policy: str, seed: int, most_steps: int | None) -> tuple[Battle, Re
 
 
 def start(battle: Battle) -> Units:
-    env_state, _ = battle.reset(jax.random.key(0))
+    env_state = state.start(battle.scenario)  # compiles nothing
     return Units(*(np.array(leaf) for leaf in env_state.units))
 
 
@@ -98,7 +98,7 @@ def around(battle: Battle, x: float, y: float, radius: float) -> np.ndarray:
 # ---------------------------------------------------------------- recordings
 
 
-@pytest.mark.parametrize("name", ["3s_vs_3z", "MMM"])
+@pytest.mark.parametrize("name", ["3s_vs_3z", pytest.param("MMM", marks=pytest.mark.slow)])
 def test_films_end_where_steps_end(name: str) -> None:
     battle = make(name)
     key = jax.random.key(1)
@@ -127,7 +127,7 @@ def test_films_of_battles_that_are_over_stand_still() -> None:
     battle = make("3s_vs_3z")
     env_state, _ = battle.reset(jax.random.key(0))
     env_state = env_state._replace(over=jnp.array(True))
-    actions = jnp.full(battle.shape.n_allies, NORTH)
+    actions = jnp.full(battle.shape.n_allies, NORTH, jnp.int32)
     after, _, film = filmed(battle.scenario, env_state, actions, jax.random.key(1))
     jax.tree.map(
         lambda shots, still: np.testing.assert_array_equal(
