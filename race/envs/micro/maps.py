@@ -24,6 +24,7 @@ of your own needs nothing else::
     cells = \"\"\"
     ....
     \"\"\"
+    levels = ...          # optional, for pictures: heights (`MapSpec`)
 
 ``ally_type_columns`` and ``enemy_type_columns``, lists of unit types, add one-hot columns of the
 type to observations and state; SMAC has them where a side has several types.
