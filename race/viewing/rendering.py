@@ -236,7 +236,7 @@ def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> 
             "pixelformat": "yuv420p",
             "macro_block_size": 2,
             "quality": None,
-            # The slowest preset that leaves a core time to draw battles as fast as they are watched.
+            # The slowest preset with which one core draws and writes battles as fast as they run.
             "output_params": ["-preset", "superfast", "-crf", "20"],
         }
     elif ending == ".gif":
