@@ -40,6 +40,8 @@ class Subject(NamedTuple):
 
     names: tuple[str, ...]
     measure: Callable[[], list[Measurement]]
+    on_request: bool = False
+    """Whether they are left out unless a pattern names them."""
 
 
 def seconds(run: Callable[[], Any]) -> float:

@@ -1,7 +1,10 @@
-"""Environment steps per second of the micromanagement battles, with random available actions.
+"""Environment steps per second of the micromanagement battles, and the kernels of a step.
 
-A step is the whole step: drawing the actions, eight game loops, observations, state, masks, reward,
-and a new battle where one has ended. Everything runs in one compiled scan.
+A step is the whole step: drawing random available actions, eight game loops, observations, state,
+masks, reward, and a new battle where one has ended. Everything runs in one compiled scan.
+
+Kernels are those of `race.envs.micro.smac.step` alone, one battle, compiled with the map as an
+argument, as `race.envs.micro.Battle.step` does (`race.bench.kernels` tells what counts).
 """
 
 import time
@@ -11,16 +14,21 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Key
 
+from race.bench.kernels import kernels_in
 from race.bench.measurement import Measurement, Subject, interleaved_best
 from race.envs.micro import Battle, make, map_names, smac
 from race.envs.micro.policies import random_actions
 
 GOALS: Final[dict[str, dict[int, float]]] = {
     "2s3z": {1: 20_000, 6: 40_000, 256: 60_000},
-    "MMM2": {1: 6_000, 6: 12_000, 256: 20_000},
+    "MMM2": {1: 6_000, 6: 10_000, 256: 20_000},
     "2c_vs_64zg": {1: 1_500, 6: 3_000, 256: 5_000},
+    "3m": {1: 30_000, 6: 70_000, 256: 120_000},
+    "corridor": {1: 3_000, 6: 5_000, 256: 8_000},
+    "27m_vs_30m": {1: 1_500, 6: 2_500, 256: 4_000},
 }
 """Steps per second of so many battles at once, all battles together, on two cores."""
 BATTLES: Final = (1, 6, 256)
@@ -32,13 +40,39 @@ ROUNDS: Final = 5
 
 
 def subjects() -> list[Subject]:
-    """The eight maps."""
-    return [Subject(_names(name), partial(measure, name)) for name in map_names()]
+    """Speed and kernels of every map; those of maps without goals only when they are asked for."""
+    return [
+        subject
+        for name in map_names()
+        for subject in (
+            Subject(_names(name), partial(measure, name), on_request=name not in GOALS),
+            Subject(
+                (_kernels_name(name),),
+                partial(measure_kernels, name),
+                on_request=name not in GOALS,
+            ),
+        )
+    ]
 
 
 def _names(name: str) -> tuple[str, ...]:
     rates = (f"micro/{name}/battles_{battles}/steps_per_second" for battles in BATTLES)
     return (*rates, f"micro/{name}/compile")
+
+
+def _kernels_name(name: str) -> str:
+    return f"micro/{name}/kernels_per_step"
+
+
+def measure_kernels(name: str) -> list[Measurement]:
+    """Kernels of one environment step of one battle of a map, its eight game loops included."""
+    battle, key = make(name), jax.random.key(0)
+    env_state, _ = jax.eval_shape(smac.reset, battle.scenario, key)
+    actions = np.zeros(battle.shape.n_allies, np.int32)
+    step = jax.jit(smac.step).lower(battle.scenario, env_state, actions, key).compile()
+    text = step.as_text()
+    assert text is not None, "this device does not show its compiled programs"
+    return [Measurement(_kernels_name(name), float(kernels_in(text).total()), "kernels")]
 
 
 def measure(name: str) -> list[Measurement]:

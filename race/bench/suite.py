@@ -22,9 +22,13 @@ def matches(name: str, pattern: str | None) -> bool:
 def chosen(every: list[Subject], pattern: str | None) -> list[Subject]:
     """The subjects with at least one measurement that is asked for.
 
+    Without a pattern, all but those that are taken on request alone.
+
     Raises:
         ConfigError: if no measurement fits the pattern; the message lists all.
     """
+    if pattern is None:
+        return [subject for subject in every if not subject.on_request]
     found = [s for s in every if any(matches(name, pattern) for name in s.names)]
     if not found:
         names = "\n  ".join(name for subject in every for name in subject.names)

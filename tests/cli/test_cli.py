@@ -6,11 +6,14 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 from pathlib import Path
 from typing import Any
 
+import imageio_ffmpeg
 import pytest
 from commands import fails, race
+from PIL import Image
 
 from race.cli import COMMANDS
 from race.cli.progress import TrainingDisplay
@@ -236,6 +239,11 @@ def test_render_a_battle(
     line = capsys.readouterr().out
     assert line == "first.mp4: 9 frames, 1 steps of the scripted policy, return 0, not finished\n"
     assert {path.name for path in tmp_path.iterdir()} == {"quiet.toml", "battle.gif", "first.mp4"}
+    with Image.open("battle.gif") as picture:
+        assert picture.size == (960, 540)
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", "first.mp4"]
+    about = subprocess.run(command, capture_output=True, text=True, check=False).stderr
+    assert re.search(r"h264.* yuv420p.* 1920x1080.* 16 fps", about), about
 
 
 @pytest.mark.parametrize(

@@ -1,37 +1,30 @@
-"""A map's ground as a picture, and a pen that draws on it in the map's cells."""
+"""Where a map's cells lie in a frame, and a pen that draws there."""
 
-import functools
 import math
 from typing import Final, NamedTuple, final
 
 import numpy as np
-from jaxtyping import UInt8
-from PIL import Image, ImageDraw, ImageFont
+from jaxtyping import Shaped, UInt8
 
-from race.envs.micro.maps import MapSpec
-from race.envs.micro.units import CLIFF, WALL
+from race.envs.micro.sprites import Color, Sprite
 
-Color = tuple[int, int, int]
 Point = tuple[float, float]
+Frame = UInt8[np.ndarray, "h w 3"]
 
-WHITE: Final[Color] = (255, 255, 255)
-_GROUND: Final[Color] = (66, 74, 70)
-_GRID: Final[Color] = (61, 69, 65)
-_WALL: Final[Color] = (31, 34, 38)
-_EDGE: Final[Color] = (96, 104, 98)
-_CLIFF: Final[Color] = (112, 94, 72)
-_CLIFF_LINE: Final[Color] = (88, 73, 56)
-_CAPTION: Final[Color] = (20, 22, 26)
-
-_OVERSAMPLING: Final = 2
-_WIDEST: Final = 760
-_HIGHEST: Final = 600
-"""Size of the ground in a frame, at most, in pixels."""
-_CAPTION_HEIGHT: Final = 26
+LARGE: Final = (1920, 1080)
+"""Width and height of a frame in pixels."""
+SMALL: Final = (960, 540)
+"""The same where a file or somebody else's window should not grow too large."""
+_LEAST_CELLS: Final = 17.0
+"""A frame is at least as many cells wide, so that a duel does not fill the screen."""
+_BAR: Final = 0.09
+"""Height of a legend above the battle as a share of the frame's."""
+_PANEL: Final = 0.17
+"""Width of a legend beside it, likewise."""
 
 
 class Window(NamedTuple):
-    """The part of a map that is drawn, in cells."""
+    """A part of a map, in cells."""
 
     left: float
     bottom: float
@@ -39,162 +32,152 @@ class Window(NamedTuple):
     top: float
 
 
-@final
-class Canvas:
-    """The ground of a window of a map, under a line for a caption.
+class Box(NamedTuple):
+    """A part of a frame, in pixels from its upper left corner."""
 
-    Attributes:
-        size: width and height of a picture in pixels; both are even, as videos want it.
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+
+class View(NamedTuple):
+    """A window of a map in a frame."""
+
+    size: tuple[int, int]
+    """Of the frame."""
+    box: Box
+    """Where the battle is; the rest of the frame is for the legend."""
+    window: Window
+    scale: float
+    """Pixels per cell."""
+
+    @property
+    def legend(self) -> Box:
+        """The strip for the legend: above the battle, or left of it."""
+        width, height = self.size
+        if self.box.top:
+            return Box(0, 0, width, self.box.top)
+        return Box(0, 0, self.box.left, height)
+
+
+def fit(
+    shown: Window, limits: tuple[int, int], size: tuple[int, int], *, short_legend: bool = True
+) -> View:
+    """The largest view of a window; what is left of the frame shows more of the map.
+
+    Args:
+        shown: what must be in the picture.
+        limits: width and height of the map, in cells.
+        size: width and height of the frame in pixels.
+        short_legend: whether the legend has room above the battle, not beside it alone.
     """
+    width, height = size
+    bar, panel = round(_BAR * height), round(_PANEL * width)
+    boxes = [Box(panel, 0, width, height)]
+    if short_legend:
+        boxes.append(Box(0, bar, width, height))
 
-    def __init__(self, spec: MapSpec, window: Window) -> None:
-        width, height = window.right - window.left, window.top - window.bottom
-        cell = max(math.floor(min(_WIDEST / width, _HIGHEST / height)), 4)
-        self._window, self._scale = window, cell * _OVERSAMPLING
-        self.size = (_even(width * cell), _even(height * cell + _CAPTION_HEIGHT))
-        self._ground = self._paint_ground(spec)
+    def scale(box: Box) -> float:
+        return min(
+            (box.right - box.left) / max(shown.right - shown.left, _LEAST_CELLS),
+            (box.bottom - box.top) / (shown.top - shown.bottom),
+        )
 
-    def begin(self) -> "Pen":
-        """A new picture of the bare ground."""
-        return Pen(self._ground.copy(), self._window, self._scale)
+    box = max(boxes, key=scale)
+    best = scale(box)
+    across, up = (box.right - box.left) / best, (box.bottom - box.top) / best
+    left, right = _widened(shown.left, shown.right, across, float(limits[0]))
+    bottom, top = _widened(shown.bottom, shown.top, up, float(limits[1]))
+    return View(size, box, Window(left, bottom, right, top), best)
 
-    def _paint_ground(self, spec: MapSpec) -> Image.Image:
-        width, height = (pixels * _OVERSAMPLING for pixels in self.size)
-        image = Image.new("RGB", (width, height), _WALL)
-        draw = ImageDraw.Draw(image)
-        window, scale, top = self._window, self._scale, _CAPTION_HEIGHT * _OVERSAMPLING
-        open_cells = [(int(x), int(y)) for x, y in np.argwhere(spec.cells != WALL)]
-        edges = []
-        for x, y in open_cells:
-            left, upper = (x - window.left) * scale, (window.top - y - 1) * scale + top
-            right, lower = left + scale, upper + scale
-            is_cliff = spec.cells[x, y] == CLIFF
-            draw.rectangle((left, upper, right, lower), fill=_CLIFF if is_cliff else _GROUND)
-            if is_cliff:
-                for row in (upper + scale / 4, lower - scale / 4):
-                    draw.line((left, row, right, row), fill=_CLIFF_LINE, width=2)
-            else:
-                draw.line((left, lower, left, upper, right, upper), fill=_GRID, width=2)
-            for neighbour, edge in (
-                ((x + 1, y), (right, upper, right, lower)),
-                ((x - 1, y), (left, upper, left, lower)),
-                ((x, y + 1), (left, upper, right, upper)),
-                ((x, y - 1), (left, lower, right, lower)),
-            ):
-                if not _is_open(spec, neighbour):
-                    edges.append(edge)
-        for edge in edges:
-            draw.line(edge, fill=_EDGE, width=4)
-        draw.rectangle((0, 0, width, top - 1), fill=_CAPTION)
-        return image
+
+def _widened(low: float, high: float, length: float, limit: float) -> tuple[float, float]:
+    """A longer stretch round one; within the map, if that is long enough, else round it."""
+    begin = (low + high - length) / 2
+    if length <= limit:
+        begin = min(max(begin, 0.0), limit - length)
+    else:
+        begin = min(max((limit - length) / 2, high - length), low)
+    return begin, begin + length
 
 
 @final
 class Pen:
-    """Draws one picture. Places and lengths are in cells; opacity is from 0 to 1."""
+    """Draws on a frame. Places and lengths are in cells; opacity is from 0 to 1."""
 
-    def __init__(self, image: Image.Image, window: Window, scale: int) -> None:
-        self._image, self._window, self._scale = image, window, scale
-        self._draw = ImageDraw.Draw(image, "RGBA")
+    def __init__(self, frame: Frame, view: View) -> None:
+        left, top, right, bottom = view.box
+        self._frame, self._view = frame, view
+        self._battle = frame[top:bottom, left:right]
 
-    def disc(
-        self,
-        centre: Point,
-        radius: float,
-        fill: Color | None,
-        opacity: float = 1.0,
-        rim: Color | None = None,
-        rim_width: float = 0.07,
-    ) -> None:
-        """A filled circle with or without a rim."""
-        column, row = self._pixel(centre)
-        reach = radius * self._scale
-        self._draw.ellipse(
-            (column - reach, row - reach, column + reach, row + reach),
-            fill=None if fill is None else _with(fill, opacity),
-            outline=rim,
-            width=self._width(rim_width) if rim else 0,
-        )
+    def stamp(self, place: Point, sprite: Sprite) -> None:
+        """A sprite with its middle at a place of the battle."""
+        column, row = self._pixel(place)
+        height, width = sprite.veil.shape[:2]
+        stamp(self._battle, math.floor(column) - width // 2, math.floor(row) - height // 2, sprite)
 
     def line(
-        self, one: Point, other: Point, color: Color, opacity: float = 1.0, width: float = 0.1
+        self, one: Point, other: Point, color: Color, opacity: float = 1.0, width: float = 0.06
     ) -> None:
         """A straight line."""
-        ends = (*self._pixel(one), *self._pixel(other))
-        self._draw.line(ends, fill=_with(color, opacity), width=self._width(width))
-
-    def label(self, centre: Point, size: float, text: str, number: str = "") -> None:
-        """A text, and a smaller number behind it, centred together."""
-        column, row = self._pixel(centre)
-        pixels = size * self._scale
-        large, small = _font(max(int(0.62 * pixels), 8)), _font(max(int(0.42 * pixels), 8))
-        width = large.getlength(text)
-        left = column - (width + small.getlength(number)) / 2
-        self._draw.text((left, row), text, fill=WHITE, font=large, anchor="lm")
-        if number:
-            below = (left + width, row + 0.12 * pixels)
-            self._draw.text(below, number, fill=(235, 240, 150), font=small, anchor="lm")
-
-    def bars(self, bottom: Point, width: float, bars: list[tuple[float, Color]]) -> None:
-        """Bars that are filled to a share, the first one lowest."""
-        column, row = self._pixel(bottom)
-        half, thick = width / 2 * self._scale, self._width(0.15)
-        for share, color in bars:
-            left, right = column - half, column + half
-            self._draw.rectangle((left, row - thick, right, row), fill=(0, 0, 0, 200))
-            if share > 0:
-                filled = left + 1 + max((right - left - 2) * share, 1)
-                self._draw.rectangle((left + 1, row - thick + 1, filled, row - 1), fill=color)
-            row -= thick + 1
-
-    def finish(
-        self, left: list[tuple[str, Color]], right: list[tuple[str, Color]]
-    ) -> UInt8[np.ndarray, "h w 3"]:
-        """The picture, with texts at both ends of the caption."""
-        image = self._image.reduce(_OVERSAMPLING)
-        draw, font = ImageDraw.Draw(image), _font(15)
-        column = 8.0
-        for text, color in left:
-            draw.text((column, _CAPTION_HEIGHT / 2), text, fill=color, font=font, anchor="lm")
-            column += font.getlength(text) + 16
-        column = image.width - 8.0
-        for text, color in reversed(right):
-            draw.text((column, _CAPTION_HEIGHT / 2), text, fill=color, font=font, anchor="rm")
-            column -= font.getlength(text)
-        return np.array(image)
+        thick = max(width * self._view.scale, 1.5)
+        line(self._battle, self._pixel(one), self._pixel(other), color, opacity, thick)
 
     def _pixel(self, place: Point) -> Point:
-        return (
-            (place[0] - self._window.left) * self._scale,
-            (self._window.top - place[1]) * self._scale + _CAPTION_HEIGHT * _OVERSAMPLING,
-        )
-
-    def _width(self, cells: float) -> int:
-        return max(round(cells * self._scale), 2)
+        window, scale = self._view.window, self._view.scale
+        return (place[0] - window.left) * scale, (window.top - place[1]) * scale
 
 
-def mixed(one: Color, other: Color, share: float) -> Color:
-    """A colour between two: ``one`` at 0, ``other`` at 1."""
-    red, green, blue = (round(a + (b - a) * share) for a, b in zip(one, other, strict=True))
-    return red, green, blue
+def stamp(frame: Frame, left: int, top: int, sprite: Sprite) -> None:
+    """Lays a sprite over a frame; what lies beyond the frame's rim is cut off."""
+    height, width = sprite.veil.shape[:2]
+    first_row, first_column = max(-top, 0), max(-left, 0)
+    part = frame[top + first_row : max(top + height, 0), left + first_column : max(left + width, 0)]
+    rows = slice(first_row, first_row + part.shape[0])
+    columns = slice(first_column, first_column + part.shape[1])
+    mixed = part * sprite.veil[rows, columns]
+    mixed >>= 8
+    mixed += sprite.ink[rows, columns]
+    part[:] = mixed
 
 
-def _with(color: Color, opacity: float) -> tuple[int, int, int, int]:
-    return (*color, round(255 * min(max(opacity, 0.0), 1.0)))
+def line(
+    frame: Frame, one: Point, other: Point, color: Color, opacity: float, width: float
+) -> None:
+    """Lays a straight line over a frame.
+
+    For each pixel along its longer side, so many across as it is wide; at its two edges a pixel
+    gets as much colour as the line covers of it. Ends are cut along the pixels.
+    """
+    (x, y), (to_x, to_y) = one, other
+    if abs(to_y - y) > abs(to_x - x):
+        frame, x, y, to_x, to_y = frame.swapaxes(0, 1), y, x, to_y, to_x
+    if to_x < x:
+        x, y, to_x, to_y = to_x, to_y, x, y
+    slope = (to_y - y) / max(to_x - x, 1e-6)
+    slant = math.sqrt(1 + slope * slope)
+    columns = np.arange(max(math.floor(x), 0), min(math.ceil(to_x), frame.shape[1]))
+    middle = y + (columns + 0.5 - x) * slope
+    half = width / 2 * slant
+    across = np.arange(math.ceil(2 * half) + 2)
+    rows = np.floor(middle - half - 0.5).astype(int)[:, None] + across
+    covered = (half - np.abs(rows + 0.5 - middle[:, None])) / slant + 0.5
+    share = opacity * np.clip(covered, 0.0, 1.0)
+    ink, inside = np.broadcast_to(columns[:, None], rows.shape), (rows >= 0) & (rows < len(frame))
+    if not inside.all():
+        rows, ink, share = rows[inside], ink[inside], share[inside]
+    _blend(frame, rows, ink, color, share)
 
 
-def _is_open(spec: MapSpec, cell: tuple[int, int]) -> bool:
-    x, y = cell
-    width, height = spec.cells.shape
-    return 0 <= x < width and 0 <= y < height and bool(spec.cells[x, y] != WALL)
-
-
-@functools.cache
-def _font(size: int) -> ImageFont.FreeTypeFont:
-    font = ImageFont.load_default(size)
-    assert isinstance(font, ImageFont.FreeTypeFont)
-    return font
-
-
-def _even(pixels: float) -> int:
-    return 2 * round(pixels / 2)
+def _blend(
+    frame: Shaped[np.ndarray, "_ _ 3"],
+    rows: Shaped[np.ndarray, "..."],
+    columns: Shaped[np.ndarray, "..."],
+    color: Color,
+    share: Shaped[np.ndarray, "..."],
+) -> None:
+    weight = (256 * share).astype(np.int32)[..., None]
+    below = frame[rows, columns].astype(np.int32)
+    below += (np.array(color, np.int32) - below) * weight >> 8
+    frame[rows, columns] = below

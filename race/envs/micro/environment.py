@@ -12,6 +12,8 @@ from jaxtyping import Array, Int, Key, UInt8
 from numpy.typing import NDArray
 
 from race.envs.micro import Battle, load_map, make, smac
+from race.envs.micro.battle import LOOPS_PER_STEP
+from race.envs.micro.canvas import SMALL
 from race.envs.micro.maps import MapSpec
 from race.envs.micro.recording import step_and_film, verdict_of
 from race.envs.micro.render import Painter, whole
@@ -139,7 +141,7 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         )
         self.action_space = spaces.MultiDiscrete([actions] * n)
         self._battle = played
-        self._painter = Painter(played, whole(played)) if render_mode else None
+        self._painter = Painter(played, whole(played), SMALL) if render_mode else None
         self._key: Any = None
         self._env_state: EnvState | None = None
         self._return = 0.0
@@ -209,7 +211,8 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             return None
         if self._env_state is None:
             raise gymnasium.error.ResetNeeded("Call reset before render.")
-        return self._painter.draw(int(self._env_state.steps), self._return, self._verdict)
+        loops = LOOPS_PER_STEP * int(self._env_state.steps)
+        return self._painter.draw(loops, self._return, self._verdict)
 
     def _next_key(self) -> Any:
         self._key, now = jax.random.split(self._key)

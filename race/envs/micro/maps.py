@@ -24,6 +24,7 @@ of your own needs nothing else::
     cells = \"\"\"
     ....
     \"\"\"
+    levels = ...          # optional, for pictures: heights (`MapSpec`)
 
 ``ally_type_columns`` and ``enemy_type_columns``, lists of unit types, add one-hot columns of the
 type to observations and state; SMAC has them where a side has several types.
@@ -97,6 +98,9 @@ class MapSpec:
         enemy_order: what the enemies do.
         rows: cells of the map, the north first: "." ground, "#" wall or pit, "C" cliff, "/" half
             a tile of ground (`race.envs.micro.units.HALF_TILES_ARE`).
+        levels: heights of the cells, for pictures alone, the north first: "0" a pit, "1" and "2"
+            two floors, "a", "b" and "c" ramps 1/8, 3/8 and 5/8 of the way up from 1 to 2. Empty
+            if they are not known.
     """
 
     name: str
@@ -108,6 +112,7 @@ class MapSpec:
     enemy_type_columns: tuple[str, ...]
     enemy_order: EnemyOrder
     rows: tuple[str, ...] = PLAIN
+    levels: tuple[str, ...] = ()
 
     @cached_property
     def cells(self) -> NDArray[Any]:
@@ -176,6 +181,7 @@ def parse_map(name: str, text: str) -> MapSpec:
         enemy_type_columns=_columns(name, table, "enemy_type_columns"),
         enemy_order=_order(name, table),
         rows=_rows(name, table),
+        levels=_levels(name, table),
     )
     _check(spec)
     return spec
@@ -266,7 +272,7 @@ def _order(name: str, table: dict[str, Any]) -> EnemyOrder:
 def _rows(name: str, table: dict[str, Any]) -> tuple[str, ...]:
     if "terrain" not in table:
         return PLAIN
-    terrain = _table(name, "'terrain'", table["terrain"], {"cells"})
+    terrain = _table(name, "'terrain'", table["terrain"], {"cells", "levels"})
     rows = tuple(_entry(name, terrain, "cells", str).split())
     if len({len(row) for row in rows}) != 1 or not re.fullmatch(r"[.#C/]+", "".join(rows)):
         raise TaskError(
@@ -276,6 +282,20 @@ def _rows(name: str, table: dict[str, Any]) -> tuple[str, ...]:
     if max(len(rows), len(rows[0])) > _MOST:
         raise TaskError(f"Map {name}: the terrain must not be longer than {_MOST} cells.")
     return rows
+
+
+def _levels(name: str, table: dict[str, Any]) -> tuple[str, ...]:
+    terrain = table.get("terrain", {})
+    if "levels" not in terrain:
+        return ()
+    levels = tuple(_entry(name, terrain, "levels", str).split())
+    lengths = [len(row) for row in _rows(name, table)]
+    if [len(row) for row in levels] != lengths or not re.fullmatch(r"[012abc]+", "".join(levels)):
+        raise TaskError(
+            f"Map {name}: levels of the terrain must be as many lines as its cells, as long as "
+            "they, out of '0', '1', '2' and, for ramps, 'a', 'b' and 'c'."
+        )
+    return levels
 
 
 def _check(spec: MapSpec) -> None:

@@ -185,6 +185,19 @@ def test_half_tiles_are_ground_or_wall_by_one_line(monkeypatch: pytest.MonkeyPat
     assert csgraph_parts(walls.cells) == [4, 100, 228]  # nobody would come through
 
 
+def test_levels_agree_with_the_cells() -> None:
+    told = [name for name in map_names() if load_map(name).levels]
+    assert told == ["2c_vs_64zg"]
+    spec = load_map("2c_vs_64zg")
+    levels = np.array([list(row) for row in spec.levels])[::-1].T
+    assert levels.shape == spec.cells.shape
+    assert not (levels[spec.cells != "#"] == "0").any()
+    # A cliff has the lower floor on one side and the higher one on the other.
+    cliff = np.argwhere(spec.cells == "C")
+    assert set(levels[cliff[:, 0], cliff[:, 1].min() - 1]) == {"1"}
+    assert set(levels[8:24, cliff[:, 1].max() + 1]) == {"2"}
+
+
 def csgraph_parts(cells: Any) -> list[int]:
     """Sizes of the parts of the ground that hang together."""
     labels, count = ndimage.label(cells == ".")
@@ -374,6 +387,12 @@ BROKEN = {
     "unknown entry of the terrain": (
         with_cells(*32 * [32 * "."]) + "height = 2\n",
         "'height'",
+    ),
+    "levels are a number": (with_cells(*32 * [32 * "."]) + "levels = 2\n", "'levels'"),
+    "levels of another size": (with_cells(*32 * [32 * "."]) + "levels = '11'\n", "levels"),
+    "unknown levels": (
+        with_cells(*32 * [32 * "."]) + 'levels = """' + 32 * (32 * "3" + "\n") + '"""\n',
+        "'0', '1', '2'",
     ),
     "goal outside": (changed("to = [9.0", "to = [-9.0"), "'to'"),
 }
