@@ -26,7 +26,8 @@ class Units(NamedTuple):
     """Velocity: the step of the last game loop."""
     vy: Float[Any, "U"]
     detour: Float[Any, "U"]
-    """Game loops for which it still goes round others to its left (to its right if below 0)."""
+    """Game loops for which it still goes round others to its left (to its right if below 0).
+    Between 0 and 1: for how long it has been stuck, as a share of its patience."""
     health: Float[Any, "U"]
     shield: Float[Any, "U"]
     energy: Float[Any, "U"]
