@@ -149,20 +149,13 @@ def _label(
     height = (1.0 if number or len(letter) > 1 else 1.3) * radius
     if height < _SMALLEST * 0.8:
         return
-    large, small = _font(round(height * _FINE)), _font(round(0.85 * height * _FINE))
-    width = large.getlength(letter)
-    left = middle - (width + small.getlength(number)) / 2
-    stroke = height * _FINE / 40
-    for text, place, font in ((letter, left, large), (number, left + width, small)):
-        if text:
-            draw.text(
-                (place, middle + (0.1 * height * _FINE if font is small else 0)),
-                text,
-                fill=color,
-                font=font,
-                anchor="lm",
-                stroke_width=stroke,
-            )
+    large, small = _font(round(height * _FINE)), _font(round(0.75 * height * _FINE))
+    left = middle - (large.getlength(letter) + small.getlength(number)) / 2
+    _, top, _, bottom = large.getbbox(letter, anchor="ls")
+    for text, font in ((letter, large), (number, small)):
+        place = left, middle - (top + bottom) / 2
+        draw.text(place, text, color, font, anchor="ls", stroke_width=height * _FINE / 40)
+        left += font.getlength(text)
 
 
 def _sprite(image: Image.Image, fine: int = _FINE) -> Sprite:
