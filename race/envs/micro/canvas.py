@@ -155,13 +155,14 @@ def line(
         frame, x, y, to_x, to_y = frame.swapaxes(0, 1), y, x, to_y, to_x
     if to_x < x:
         x, y, to_x, to_y = to_x, to_y, x, y
-    length = max(math.hypot(to_x - x, to_y - y), 1e-6)
+    length, half = math.hypot(to_x - x, to_y - y), width / 2
+    if length < 1e-3:
+        return
     ahead, aside = (to_x - x) / length, (to_y - y) / length
-    half = width / 2
     begin, end = math.floor(x - half), math.ceil(to_x + half)
     columns = np.arange(max(begin, 0), min(end, frame.shape[1]))
     away = columns + 0.5 - x
-    middle, thick = y + away * aside / max(ahead, 1e-6), half / max(ahead, 1e-6)
+    middle, thick = y + away * aside / ahead, half / ahead
     across = np.arange(math.ceil(2 * thick) + 2)
     rows = np.floor(middle - thick - 0.5).astype(int)[:, None] + across
     beside = half + 0.5 - np.abs(rows + 0.5 - middle[:, None]) * ahead

@@ -19,6 +19,8 @@ DARK: Final[Color] = (12, 14, 18)
 
 _FINE: Final = 4
 """How much larger a picture is drawn."""
+_SMALLEST: Final = 9.0
+"""Height of letters that can still be read."""
 
 
 class Sprite(NamedTuple):
@@ -110,7 +112,7 @@ def cross(radius: float, color: Color, opacity: float) -> Sprite:
     return _sprite(image)
 
 
-@functools.lru_cache(maxsize=2048)
+@functools.lru_cache(maxsize=256)
 def words(text: str, height: int, color: Color) -> Sprite:
     """A line of text; it is as high for every text of a height."""
     font = _font(height)
@@ -134,10 +136,6 @@ def _disc(
     reach = radius * _FINE
     box = (middle - reach, middle - reach, middle + reach, middle + reach)
     draw.ellipse(box, fill=(*color, round(255 * opacity)))
-
-
-_SMALLEST: Final = 9.0
-"""Height of letters that can still be read."""
 
 
 def _label(

@@ -592,6 +592,15 @@ def test_lines_cover_as_much_as_they_should(end: tuple[float, float], width: flo
     np.testing.assert_array_equal(back, frame)
 
 
+def test_a_line_without_length_is_none() -> None:
+    frame = np.zeros((20, 20, 3), np.uint8)
+    for end in ((5.0, 5.0), (5.0, 5.0000001), (5.0000001, 5.0)):
+        line(frame, (5.0, 5.0), end, (250, 0, 0), 1.0, 3.0)
+    assert not frame.any()
+    line(frame, (5.0, 5.0), (5.0, 5.6), (250, 0, 0), 1.0, 3.0)
+    assert 0 < frame.sum() / 250 < 6
+
+
 def test_what_reaches_beyond_a_frame_is_cut_off() -> None:
     whole_one, part = np.zeros((80, 80, 3), np.uint8), np.zeros((40, 40, 3), np.uint8)
     spot = disc(9.0, (200, 100, 50), 0.7)
