@@ -147,23 +147,28 @@ def line(
 ) -> None:
     """Lays a straight line over a frame.
 
-    For each pixel along its longer side, so many across as it is wide; at its two edges a pixel
-    gets as much colour as the line covers of it. Ends are cut along the pixels.
+    For each pixel along its longer side, so many across as it is wide; at its edges and ends a
+    pixel gets about as much colour as the line covers of it.
     """
     (x, y), (to_x, to_y) = one, other
     if abs(to_y - y) > abs(to_x - x):
         frame, x, y, to_x, to_y = frame.swapaxes(0, 1), y, x, to_y, to_x
     if to_x < x:
         x, y, to_x, to_y = to_x, to_y, x, y
-    slope = (to_y - y) / max(to_x - x, 1e-6)
-    slant = math.sqrt(1 + slope * slope)
-    columns = np.arange(max(math.floor(x), 0), min(math.ceil(to_x), frame.shape[1]))
-    middle = y + (columns + 0.5 - x) * slope
-    half = width / 2 * slant
-    across = np.arange(math.ceil(2 * half) + 2)
-    rows = np.floor(middle - half - 0.5).astype(int)[:, None] + across
-    covered = (half - np.abs(rows + 0.5 - middle[:, None])) / slant + 0.5
-    share = opacity * np.clip(covered, 0.0, 1.0)
+    length, half = math.hypot(to_x - x, to_y - y), width / 2
+    if length < 1e-3:
+        return
+    ahead, aside = (to_x - x) / length, (to_y - y) / length
+    begin, end = math.floor(x - half), math.ceil(to_x + half)
+    columns = np.arange(max(begin, 0), min(end, frame.shape[1]))
+    away = columns + 0.5 - x
+    middle, thick = y + away * aside / ahead, half / ahead
+    across = np.arange(math.ceil(2 * thick) + 2)
+    rows = np.floor(middle - thick - 0.5).astype(int)[:, None] + across
+    beside = half + 0.5 - np.abs(rows + 0.5 - middle[:, None]) * ahead
+    along = (away * ahead)[:, None] + (rows + 0.5 - y) * aside
+    inward = np.minimum(along, length - along) + 0.5
+    share = opacity * np.clip(beside, 0.0, 1.0) * np.clip(inward, 0.0, 1.0)
     ink, inside = np.broadcast_to(columns[:, None], rows.shape), (rows >= 0) & (rows < len(frame))
     if not inside.all():
         rows, ink, share = rows[inside], ink[inside], share[inside]

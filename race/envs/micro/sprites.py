@@ -19,6 +19,8 @@ DARK: Final[Color] = (12, 14, 18)
 
 _FINE: Final = 4
 """How much larger a picture is drawn."""
+_SMALLEST: Final = 9.0
+"""Height of letters that can still be read."""
 
 
 class Sprite(NamedTuple):
@@ -110,7 +112,7 @@ def cross(radius: float, color: Color, opacity: float) -> Sprite:
     return _sprite(image)
 
 
-@functools.lru_cache(maxsize=2048)
+@functools.lru_cache(maxsize=256)
 def words(text: str, height: int, color: Color) -> Sprite:
     """A line of text; it is as high for every text of a height."""
     font = _font(height)
@@ -136,10 +138,6 @@ def _disc(
     draw.ellipse(box, fill=(*color, round(255 * opacity)))
 
 
-_SMALLEST: Final = 9.0
-"""Height of letters that can still be read."""
-
-
 def _label(
     draw: ImageDraw.ImageDraw, middle: float, radius: float, label: str, color: Color
 ) -> None:
@@ -149,20 +147,13 @@ def _label(
     height = (1.0 if number or len(letter) > 1 else 1.3) * radius
     if height < _SMALLEST * 0.8:
         return
-    large, small = _font(round(height * _FINE)), _font(round(0.85 * height * _FINE))
-    width = large.getlength(letter)
-    left = middle - (width + small.getlength(number)) / 2
-    stroke = height * _FINE / 40
-    for text, place, font in ((letter, left, large), (number, left + width, small)):
-        if text:
-            draw.text(
-                (place, middle + (0.1 * height * _FINE if font is small else 0)),
-                text,
-                fill=color,
-                font=font,
-                anchor="lm",
-                stroke_width=stroke,
-            )
+    large, small = _font(round(height * _FINE)), _font(round(0.75 * height * _FINE))
+    left = middle - (large.getlength(letter) + small.getlength(number)) / 2
+    _, top, _, bottom = large.getbbox(letter, anchor="ls")
+    for text, font in ((letter, large), (number, small)):
+        place = left, middle - (top + bottom) / 2
+        draw.text(place, text, color, font, anchor="ls", stroke_width=height * _FINE / 40)
+        left += font.getlength(text)
 
 
 def _sprite(image: Image.Image, fine: int = _FINE) -> Sprite:
