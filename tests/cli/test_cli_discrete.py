@@ -374,7 +374,7 @@ def test_every_setting_of_facmac_is_tried() -> None:
         ("train micro/2s3z --algo maddpg", "Use --algo facmac"),
         ("train probe/matching --base matd3", "RACE(MATD3) does not work on probe/matching"),
         ("train probe/matchin", "probe/matching"),
-        ("train micro/3s_vs_4z", "nearest names are 3s_vs_3z"),
+        ("train micro/3s_vs_9z", "nearest names are 3s_vs_3z"),
         (
             "train test_cli_discrete:without_a_game",
             "without_a_game failed: FileNotFoundError: [Errno 2] No such file or directory: "
