@@ -3,6 +3,7 @@
 A family of tasks may be added or changed here; whoever trains sees `race.types.AnyTask` alone.
 """
 
+import contextlib
 import difflib
 import importlib
 import inspect
@@ -18,9 +19,10 @@ import numpy as np
 
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
-from race.envs import discrete_probe, mamujoco, probe
-from race.errors import TaskError, blamed
-from race.types import AnyTask, DiscreteTask, EnvSpec, Task
+from race.envs import contract, discrete_probe, mamujoco, probe
+from race.envs.checked import takes
+from race.errors import HandedOverError, TaskError, blamed, described
+from race.types import AnyTask, DiscreteTask, EnvSpec, Name, Task, Whole
 
 __all__ = [
     "TaskInfo",
@@ -183,9 +185,11 @@ def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
             f"directory ({Path.cwd()}) and among the installed packages; the name is that of the "
             "file without .py, with dots for folders."
         ) from error
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:
         raise TaskError(
-            f"Task {task_id}: importing {module_name} failed with {type(error).__name__}: {error}."
+            f"Task {task_id}: importing {module_name} failed with {described(error)}."
         ) from error
     function = getattr(module, function_name, None)
     if not callable(function):
@@ -212,10 +216,10 @@ def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
 def factorised(
     make: Callable[[str | None], gymnasium.Env[Any, Any]],
     *,
-    obs_index: Sequence[Sequence[int]],
-    action_index: Sequence[Sequence[int]],
-    task: str,
-    episode_limit: int | None = None,
+    obs_index: Sequence[Sequence[int]] | Any,
+    action_index: Sequence[Sequence[int]] | Any,
+    task: Name,
+    episode_limit: Whole | None = None,
 ) -> Task:
     """A task out of a gymnasium environment: who sees which entries, who moves which.
 
@@ -235,10 +239,20 @@ def factorised(
         TaskError: if spaces are not flat boxes, actions are unbounded, no limit is known, or the
             indices do not fit.
     """
-    env = make(None)
+    with blamed(TaskError, f"Task {task}: make(None) failed"):
+        env = make(None)
+    if not all(hasattr(env, name) for name in ("observation_space", "action_space", "reset")):
+        raise TaskError(
+            f"Task {task}: make(None) returned {contract.came(env)} instead of a gymnasium "
+            "environment. Let it return one."
+        )
     try:
         state_size = _flat_box(env.observation_space, "observation", task).shape[0]
         actions = _flat_box(env.action_space, "action", task)
+        try:
+            contract.refuse_whole(actions)
+        except HandedOverError as error:
+            raise TaskError(f"Task {task}: {error}.") from error
         if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
             raise TaskError(
                 f"Task {task}: the action space {actions} has no finite bounds. Give each entry a "
@@ -246,24 +260,27 @@ def factorised(
                 "in the environment's Box."
             )
         if episode_limit is None:
-            episode_limit = env.spec.max_episode_steps if env.spec is not None else None
+            registered = getattr(env, "spec", None)
+            episode_limit = registered.max_episode_steps if registered is not None else None
         if episode_limit is None:
             raise TaskError(
                 f"Task {task}: the environment is registered with no time limit. Wrap it in "
                 "gymnasium.wrappers.TimeLimit and pass the same number as episode_limit."
             )
+        seeded = takes(env.reset, seed=0)
     finally:
-        env.close()
+        with contextlib.suppress(Exception, SystemExit):  # it would hide what was wrong before
+            env.close()
     spec = EnvSpec(
         task=task,
         state_size=state_size,
-        obs_index=tuple(tuple(map(int, agent)) for agent in obs_index),
-        action_index=tuple(tuple(map(int, agent)) for agent in action_index),
+        obs_index=obs_index,
+        action_index=action_index,
         action_low=tuple(actions.low.tolist()),
         action_high=tuple(actions.high.tolist()),
         episode_limit=episode_limit,
     )
-    return Task(spec, make)
+    return Task(spec, make, seeded)
 
 
 def _flat_box(space: Any, what: str, task: str) -> gymnasium.spaces.Box:

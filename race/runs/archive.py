@@ -25,7 +25,7 @@ DIGITS = 6
 """Significant digits of numbers that are not whole; a test return's noise is in its third."""
 
 # Of a generation's row: what is the newest value, not a mean over generations.
-_LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/")
+_LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/", "env/")
 _DAMAGES = (ValueError, KeyError, TypeError, EOFError, IndexError, StopIteration, zlib.error)
 # Of a run's origin: the versions that may change numbers.
 _ORIGIN = (

@@ -78,6 +78,11 @@ class MetricsWriter:
             ) from error
         self.offset += len(line)
 
+    def forget(self, offset: int) -> None:
+        """Drops the rows after ``offset``, a value that `offset` had before."""
+        self._file.truncate(offset)
+        self.offset = offset
+
     def sync(self) -> None:
         """Waits until the rows are on the disk: after it, `offset` survives a power failure."""
         os.fsync(self._file.fileno())

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from race.algorithms import algorithm_of
 from race.algorithms.base import Teams, tested_teams
 from race.config.settings import Config, TeamName
-from race.envs import make_task
-from race.errors import ConfigError, RunDirectoryError, TaskError
+from race.envs import contract, make_task
+from race.errors import ConfigError, RunDirectoryError
 from race.programs import act
 from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints
@@ -49,8 +49,11 @@ class Trained(NamedTuple):
             )
         return name
 
-    def policy(self, team: TeamName) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    def policy(self, team: TeamName) -> Callable[[ArrayLike], NDArray[np.float32]]:
         """The team as a function from a state [S] to a joint action [U] in [-1, 1].
+
+        The function raises `HandedOverError` for what an environment of the task may not show:
+        another shape, or an entry that is not finite.
 
         Raises:
             ConfigError: if the run has no such team, or its task has discrete actions.
@@ -63,8 +66,9 @@ class Trained(NamedTuple):
         teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
         spec, base = self.task.spec, str(self.config.base)
 
-        def joint_action(state: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.asarray(act(teams, state[None], spec=spec, base=base))[0]
+        def joint_action(state: ArrayLike) -> NDArray[np.float32]:
+            seen = contract.state(spec, state)
+            return np.asarray(act(teams, seen[None], spec=spec, base=base))[0]
 
         return joint_action
 
@@ -103,19 +107,14 @@ class RecurrentPolicy:
             avail_actions: which actions each can take, [N, A], at least one.
 
         Raises:
-            TaskError: if an array has another shape.
+            HandedOverError: for what an environment of the task may not show: another shape, an
+                entry that is not finite, a mask of something else than 0 and 1, no action.
         """
-        spec = self._spec
-        arrays = np.array(obs, np.float32), np.array(avail_actions, bool)
-        sizes = (spec.n_agents, spec.obs_size), (spec.n_agents, spec.n_actions)
-        for name, array, size in zip(("obs", "avail_actions"), arrays, sizes, strict=True):
-            if array.shape != size:
-                raise TaskError(
-                    f"{name} of {spec.task} has the shape {size}; it was given {array.shape}."
-                )
         # Teams choose by what agents observe; the state is for the learner alone.
-        state = np.zeros((1, spec.state_size), np.float32)
-        seen = Observation(arrays[0][None], state, arrays[1][None])
+        state = np.zeros(self._spec.state_size, np.float32)
+        shown = {"obs": obs, "state": state, "avail_actions": avail_actions}
+        moment = contract.moment(self._spec, shown)
+        seen = Observation(*(column[None] for column in moment))
         self._memory, action = _choose(self._teams, self._memory, seen, np.int32(0), None)
         return np.asarray(action)[0]
 

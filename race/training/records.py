@@ -63,4 +63,6 @@ def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str,
 
 def _counters(progress: Progress) -> dict[str, Any]:
     names = ("generation", "env_steps", "gradient_steps", "wall_seconds")
-    return {name: getattr(progress, name) for name in names}
+    counters = {name: getattr(progress, name) for name in names}
+    repeated = {"env/repeated_episodes": progress.repeated} if progress.repeated else {}
+    return counters | repeated

@@ -14,7 +14,7 @@ import jax
 from race.algorithms import algorithm_of
 from race.config.settings import Config
 from race.envs import make_task
-from race.errors import ConfigError, DivergenceError
+from race.errors import ConfigError, DivergenceError, TaskError, command
 from race.rollouts import rollouts_of
 from race.runs import checkpoints
 from race.runs import directory as run_directory
@@ -62,7 +62,7 @@ def train(
         if not _must_go_on(path, config, extend, made):
             run_directory.mark_finished(path)
             return made
-        rollouts = rollouts_of(config, task)
+        rollouts = rollouts_of(config, task, proven=made.env_steps > 0)
         if saved is None:
             origin = run_directory.read_metadata(path)
             check_version(origin.get("algorithm_version", 1) if origin else None)
@@ -93,6 +93,7 @@ def train(
                 report=report,
                 clock=Clock(state.progress.times, config.checkpoint.minutes),
                 began=began,
+                repeated_before=state.progress.repeated,
             )
             try:
                 progress = _train(run, state).progress
@@ -130,6 +131,25 @@ def _last_good(directory: RunDirectory) -> str:
     return f"The last good checkpoint is {newest}; evaluate and render use it."
 
 
+def _advance(run: Run, state: RunState) -> RunState:
+    """`advance`; if an environment ends it, what was before is saved first.
+
+    Raises:
+        TaskError: if an environment fails, or hands over what it may not.
+    """
+    rows = run.metrics.offset
+    try:
+        return advance(run, state)
+    except TaskError as error:
+        run.metrics.forget(rows)  # they are written again when the run goes on
+        save(run, state)
+        go_on = command("race", "resume", run.directory.path)
+        raise type(error)(
+            f"{error} The run was saved at {state.progress.env_steps:,} environment steps; once "
+            f"that is mended, go on with: {go_on}"
+        ) from error
+
+
 def _train(run: Run, state: RunState) -> RunState:
     if state.progress.env_steps == 0:
         state = warm_up(run, state)
@@ -137,7 +157,7 @@ def _train(run: Run, state: RunState) -> RunState:
             return state  # there is nothing yet that starting again would not bring back
         save(run, state)
     while not is_over(run.config, state.progress):
-        state = advance(run, state)
+        state = _advance(run, state)
         if run.interrupts.requested:
             break
         if run.clock.checkpoint_due():
