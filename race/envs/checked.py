@@ -123,7 +123,7 @@ class CheckedEnv:
             drawn = self._env.render()
         except BaseException as error:
             self._failed(error, f"while it was drawn, {self._where()}")
-        picture = drawn if isinstance(drawn, np.ndarray) else np.zeros(())
+        picture: NDArray[Any] = drawn if isinstance(drawn, np.ndarray) else np.zeros(())
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] not in (3, 4):
             raise RenderError(
                 f"The environment of {self._spec.task} drew no picture: render returned "

@@ -81,7 +81,7 @@ def numbers(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32
         square = flat.dot(flat)
     if not square <= LARGEST**2:  # the norm is no smaller than any entry
         for place in np.argwhere(~(np.abs(array) <= LARGEST)).tolist():
-            entry = array[tuple(place)]
+            entry = float(array[tuple(place)])
             where = place[0] if len(place) == 1 else tuple(place)
             raise HandedOverError(f"entry {where} of {name} is {entry}. {_too_large(entry)}")
     return array.astype(np.float32)

@@ -69,7 +69,7 @@ class EpisodeRollouts:
         """A short run does not pay for a long one's memory: an episode has at least one step."""
         facmac = self._config.facmac
         most = max(self._config.env_steps + self._config.n_teams, facmac.batch_size)
-        item = empty_episode(self._spec, facmac.replay_precision)
+        item = empty_episode(self._spec, str(facmac.replay_precision))
         return init_replay(item, min(facmac.replay_capacity, most))
 
     def warm_up(
@@ -150,7 +150,7 @@ class EpisodeRollouts:
 
     def _play(self, teams: Teams, seeds: NDArray[np.int64], how: Exploration | None) -> Played:
         small = (seeds % 2**31).astype(np.uint32)
-        precision = self._config.facmac.replay_precision
+        precision = str(self._config.facmac.replay_precision)
         if self._env is None:
             return self._host.play(teams, small, how, precision)
         return device.play(self._env, teams, small, how, self._spec, precision)

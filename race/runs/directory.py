@@ -12,7 +12,7 @@ from typing import Any
 from race.config import settings as configs
 from race.config.presets import resolve
 from race.config.settings import Config
-from race.errors import ConfigError, RunDirectoryError
+from race.errors import ConfigError, RunDirectoryError, command
 from race.runs.metadata import metadata
 
 
@@ -67,13 +67,8 @@ def create(
         RunDirectoryError: if ``path`` already holds a run, is a file, or cannot be written.
     """
     run = RunDirectory(path)
-    occupied = RunDirectoryError(
-        f"{path} already holds a run. Continue it with `race resume {path}`, or choose another "
-        "directory with `--run-dir`."
-    )
     try:
-        if any(part.exists() for part in (run.config, run.metrics, run.checkpoints)):
-            raise occupied
+        refuse_occupied(path)
         path.mkdir(parents=True, exist_ok=True)
         text = _json(metadata(environment or {}))
         # Whoever gets config.json there first owns the directory; only then is the rest written.
@@ -81,16 +76,42 @@ def create(
         _write(run.metadata, text)
     except FileExistsError as error:
         if path.is_dir():
-            raise occupied from error
+            raise _occupied(path) from error
         raise RunDirectoryError(
             f"{path} is a file, not a directory. Choose another directory with `--run-dir`."
         ) from error
     except OSError as error:
-        raise RunDirectoryError(
-            f"The run directory {path} cannot be written: {error}. Choose another directory with "
-            "`--run-dir`, or see that this one is writable and the disk is not full."
-        ) from error
+        raise _not_writable(path, error) from error
     return run
+
+
+def refuse_occupied(path: Path) -> None:
+    """Refuses a directory that holds a run, before time is spent on a new one.
+
+    Raises:
+        RunDirectoryError: if there is a run.
+    """
+    run = RunDirectory(path)
+    try:
+        occupied = any(part.exists() for part in (run.config, run.metrics, run.checkpoints))
+    except OSError as error:  # such as a name that is too long
+        raise _not_writable(path, error) from error
+    if occupied:
+        raise _occupied(path)
+
+
+def _occupied(path: Path) -> RunDirectoryError:
+    return RunDirectoryError(
+        f"{path} already holds a run. Continue it with `{command('race', 'resume', path)}`, or "
+        "choose another directory with `--run-dir`."
+    )
+
+
+def _not_writable(path: Path, error: OSError) -> RunDirectoryError:
+    return RunDirectoryError(
+        f"The run directory {path} cannot be written: {error}. Choose another directory with "
+        "`--run-dir`, or see that this one is writable and the disk is not full."
+    )
 
 
 def change_config(path: Path, config: Config) -> None:

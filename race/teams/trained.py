@@ -1,6 +1,7 @@
 """Trained teams, read back from a run directory, ready to act."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -13,7 +14,7 @@ from race.algorithms import algorithm_of
 from race.algorithms.base import Teams, tested_teams
 from race.config.settings import Config, TeamName
 from race.envs import contract, make_task
-from race.errors import ConfigError, RunDirectoryError
+from race.errors import ConfigError, HandedOverError, RunDirectoryError
 from race.programs import act
 from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints
@@ -67,7 +68,8 @@ class Trained(NamedTuple):
         spec, base = self.task.spec, str(self.config.base)
 
         def joint_action(state: ArrayLike) -> NDArray[np.float32]:
-            seen = contract.state(spec, state)
+            with _told(spec.task):
+                seen = contract.state(spec, state)
             return np.asarray(act(teams, seen[None], spec=spec, base=base))[0]
 
         return joint_action
@@ -113,10 +115,21 @@ class RecurrentPolicy:
         # Teams choose by what agents observe; the state is for the learner alone.
         state = np.zeros(self._spec.state_size, np.float32)
         shown = {"obs": obs, "state": state, "avail_actions": avail_actions}
-        moment = contract.moment(self._spec, shown)
+        with _told(self._spec.task):
+            moment = contract.moment(self._spec, shown)
         seen = Observation(*(column[None] for column in moment))
         self._memory, action = _choose(self._teams, self._memory, seen, np.int32(0), None)
         return np.asarray(action)[0]
+
+
+@contextlib.contextmanager
+def _told(task: str) -> Iterator[None]:
+    try:
+        yield
+    except HandedOverError as error:
+        raise HandedOverError(
+            f"The team was shown what no environment of {task} may show: {error}."
+        ) from error
 
 
 def load_trained(path: Path) -> Trained:

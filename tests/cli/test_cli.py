@@ -12,7 +12,7 @@ from typing import Any
 
 import imageio_ffmpeg
 import pytest
-from commands import fails, race
+from commands import alone, fails, race
 from PIL import Image
 
 from race.cli import COMMANDS
@@ -75,7 +75,8 @@ def test_a_run_directory_holds_what_it_should(trained: Path) -> None:
 
 
 def test_presets_are_defaults_and_flags_win(tmp_path: Path) -> None:
-    race(f"train probe/terminates --preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {SMALL}")
+    options = f"--preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {alone(SMALL)}"
+    race(f"train probe/terminates {options}")
     learner = json.loads((tmp_path / "a" / "config.json").read_text())["learner"]
     assert learner["actor_learning_rate"] == 3e-4  # from the preset
     assert learner["batch_size"] == 8  # from the flags
@@ -315,7 +316,7 @@ def test_bad_input_to_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_champion_needs_a_population(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {SMALL}")
+    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {alone(SMALL)}")
     capsys.readouterr()
     assert "no population" in fails(f"evaluate {tmp_path / 'run'} --team champion", capsys)
 
