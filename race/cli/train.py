@@ -22,7 +22,7 @@ from race.config.settings import (
     Preset,
     RaceConfig,
 )
-from race.errors import ConfigError, RunDirectoryError, say
+from race.errors import ConfigError, RunDirectoryError, command, say
 from race.types import AnyTask, DiscreteTask
 
 
@@ -77,8 +77,9 @@ def main(arguments: list[str]) -> None:
     )
     # Not before the arguments are parsed: these take a second to import.
     from race.cli.seeds import SHARED_ACCELERATOR, run_all
-    from race.cli.training import describe, run
+    from race.cli.training import run
     from race.envs import make_task
+    from race.envs.description import describe
     from race.runs import directory as run_directory
 
     if chosen.seeds is not None:  # this process only watches
@@ -102,14 +103,13 @@ def main(arguments: list[str]) -> None:
 
 def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """What a first look at an environment of the user's own says; others repeat."""
-    from rich.console import Console
-
+    from race.cli import streams
     from race.envs.own import is_own
     from race.envs.trial import try_out
 
     if not is_own(task_id):
         return {"repeats": True}
-    with Console(stderr=True).status("trying the environment"):
+    with streams.console(stderr=True).status("trying the environment"):
         trial = try_out(task)
     if trial.note:
         say(trial.note)
@@ -119,7 +119,7 @@ def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
 def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:
     """Makes the run directories of several seeds, or none."""
     from race.cli.seeds import check_jobs, parse_seeds
-    from race.cli.training import describe
+    from race.envs.description import describe
     from race.runs import directory as run_directory
 
     seeds = parse_seeds(str(chosen.seeds))
@@ -131,8 +131,9 @@ def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> Non
     for place in (path, *places):
         if (place / "config.json").exists():
             raise RunDirectoryError(
-                f"{place} already holds a run. Go on with all runs of {path} by `race resume "
-                f"{path}`, or choose another directory with `--run-dir`."
+                f"{place} already holds a run. Go on with all runs of {path} by "
+                f"`{command('race', 'resume', path)}`, or choose another directory with "
+                "`--run-dir`."
             )
     described = describe(task) | _tried(config.task, task)
     for place, one in zip(places, configs, strict=True):

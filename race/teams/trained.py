@@ -14,14 +14,15 @@ from race.algorithms import algorithm_of
 from race.algorithms.base import Teams, tested_teams
 from race.config.settings import Config, TeamName
 from race.envs import contract, make_task
-from race.errors import ConfigError, HandedOverError, RunDirectoryError
+from race.envs.description import refuse_changed
+from race.errors import ConfigError, HandedOverError, RunDirectoryError, command
 from race.programs import act
 from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.training.run_state import Progress
-from race.training.saving import learned_of, progress_of
+from race.training.saving import check_owner, learned_of, progress_of
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
 
 _choose = jax.jit(choose)
@@ -144,10 +145,12 @@ def load_trained(path: Path) -> Trained:
     if newest is None:
         raise RunDirectoryError(
             f"The run in {path} has no checkpoint yet. Wait for its first one, or go on with it: "
-            f"race resume {path}"
+            + command("race", "resume", path)
         )
     saved = checkpoints.load(newest, tables=False)
+    check_owner(saved, run_directory.identity_of(path))
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
+    refuse_changed(run_directory.recorded_task(path), task)
     state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
     encoder, heads = tested_teams(algorithm, state, task.spec, config.has_population)
     return Trained(config, task, progress_of(saved), encoder, heads)

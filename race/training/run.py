@@ -36,6 +36,7 @@ class Run:
     report: Report
     clock: Clock
     began: float  # time.perf_counter() when the process began
+    identity: str | None  # of the run: its checkpoints and metrics name it
     repeated_before: int = 0  # episodes that were begun anew before this process
 
     @property
