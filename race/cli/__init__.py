@@ -32,10 +32,6 @@ _SMALLER = (
     "buffer (--learner.replay-capacity). On tasks with discrete actions these are "
     "--facmac.hidden-size, --facmac.batch-size and --facmac.replay-capacity."
 )
-_BACKEND = (
-    "JAX cannot use the accelerator that it was told to ({told}). Unset JAX_PLATFORMS, or set it "
-    "to cpu, to compute on the processor; `race doctor` shows what is here."
-)
 
 _EXAMPLE = """\
 For example:
@@ -55,6 +51,10 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:  # the reader of our output, such as `head`, has gone
         streams.silence(sys.stdout)
         sys.exit(141)
+    except OSError as error:
+        streams.silence(sys.stdout)
+        say(f"race: the output could not be written: {error}.")
+        sys.exit(1)
     finally:
         failure = streams.finish()
     if failure is not None:
@@ -103,8 +103,6 @@ def _told(command: str, error: Exception) -> str | None:
             return f"{error}. See that the disk is not full and that files can be read and written."
         case RuntimeError() if "RESOURCE_EXHAUSTED" in str(error):  # what JAX calls it
             return out_of_memory
-        case RuntimeError() if "nable to initialize backend" in str(error):
-            return _BACKEND.format(told=" ".join(str(error).split())[:200])
     return None
 
 

@@ -78,12 +78,14 @@ def main(arguments: list[str]) -> None:
     # Not before the arguments are parsed: these take a second to import.
     from race.cli.seeds import SHARED_ACCELERATOR, run_all
     from race.cli.training import run
+    from race.compilation import use_cache
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
 
     if chosen.seeds is not None:  # this process only watches
         os.environ.update(SHARED_ACCELERATOR)
+    use_cache()
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)
     _refuse_without_effect(asked, chosen.preset, task)

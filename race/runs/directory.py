@@ -80,8 +80,8 @@ def create(
     run = RunDirectory(path)
     try:
         refuse_occupied(path)
-        path.mkdir(parents=True, exist_ok=True)
         text = _json(metadata(environment or {}))
+        path.mkdir(parents=True, exist_ok=True)
         # Whoever gets config.json there first owns the directory; only then is the rest written.
         identity = secrets.token_hex(8)
         _write(run.config, _config_text(config, identity), exclusive=True)
