@@ -27,8 +27,8 @@ def check_backend() -> None:
         asked = os.environ.get("JAX_PLATFORMS", "")
         told = " ".join(str(error).split())[:200] or "it does not say why"
         raise RaceError(
-            f"JAX cannot compute here with JAX_PLATFORMS={asked!r} ({told}). Unset it, or set it to "
-            "cpu, to compute on the processor; `race doctor` shows what is here."
+            f"JAX cannot compute here with JAX_PLATFORMS={asked!r} ({told}). Unset it, or set it "
+            "to cpu, to compute on the processor; `race doctor` shows what is here."
         ) from error
 
 
