@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from race import __version__
+from race.compilation import check_backend
 from race.runs.metadata import DISTRIBUTION
 from race.viewing.rendering import PACKAGES, choose_renderer
 
@@ -36,7 +37,7 @@ def examine(cache: Path) -> Iterator[Finding]:
     yield _python()
     yield from _packages()
     checks: list[tuple[str, Callable[[], Finding], str]] = [
-        ("accelerator", _accelerator, "pip install --force-reinstall jax"),
+        ("accelerator", _accelerator, "unset JAX_PLATFORMS"),
         ("physics", _physics, "pip install --force-reinstall 'gymnasium[mujoco]'"),
         ("renderer", _renderer, PACKAGES),
         ("video", _video, "pip install --force-reinstall imageio-ffmpeg"),
@@ -82,6 +83,7 @@ def _packages() -> Iterator[Finding]:
 def _accelerator() -> Finding:
     import jax
 
+    check_backend()
     devices = jax.devices()
     kinds = ", ".join(f"{d.platform} {d.device_kind}" for d in devices)
     if devices[0].platform == "cpu" and shutil.which("nvidia-smi"):

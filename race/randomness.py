@@ -28,3 +28,8 @@ def host_seeds(seed: int, purpose: Purpose, index: int, count: int) -> NDArray[n
     """Seeds for environments, from the run's seed, the purpose and a counter."""
     sequence = np.random.SeedSequence((seed, int(purpose), index))
     return sequence.generate_state(count).astype(np.int64)
+
+
+def seed_again(seed: int, attempt: int) -> int:
+    """The seed of an episode that is begun anew, from that of the first attempt; below 2**31."""
+    return int(np.random.SeedSequence((seed, attempt)).generate_state(1)[0]) >> 1

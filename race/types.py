@@ -20,10 +20,12 @@ letter      axis
 ==========  =====================================================================
 """
 
-from collections.abc import Callable
+import dataclasses
+import operator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -31,6 +33,18 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import NDArray
 
 from race.errors import TaskError
+
+LARGEST: Final = 1e15
+"""Largest magnitude of what environments show, pay and are told. Networks compute in 32 bits, where
+squares of more would overflow, and the networks would be blamed."""
+
+
+# What users write down of a task is checked and put in order when it is written, so that the type
+# checks of the tests let everything in; from then on it is of the first type.
+Whole = int | Any
+Indices = tuple[tuple[int, ...], ...] | Any
+Bounds = tuple[float, ...] | Any
+Name = str | Any
 
 
 class Transition(NamedTuple):
@@ -124,19 +138,26 @@ class EnvSpec:
         episode_limit: steps after which an episode is cut off (truncated).
 
     Raises:
-        TaskError: if an index is out of range, or the agents' actions do not cover each entry of
-            the joint action exactly once.
+        TaskError: if something is of the wrong kind, an index is out of range, or the agents'
+            actions do not cover each entry of the joint action exactly once.
     """
 
-    task: str
-    state_size: int
-    obs_index: tuple[tuple[int, ...], ...]
-    action_index: tuple[tuple[int, ...], ...]
-    action_low: tuple[float, ...]
-    action_high: tuple[float, ...]
-    episode_limit: int
+    task: Name
+    state_size: Whole
+    obs_index: Indices
+    action_index: Indices
+    action_low: Bounds
+    action_high: Bounds
+    episode_limit: Whole
 
     def __post_init__(self) -> None:
+        _keep(self, "task", _name(self.task))
+        for field in ("state_size", "episode_limit"):
+            _keep(self, field, _whole(getattr(self, field), field, self.task, least=1))
+        for field in ("obs_index", "action_index"):
+            _keep(self, field, _indices(getattr(self, field), field, self.task))
+        for field in ("action_low", "action_high"):
+            _keep(self, field, _bounds(getattr(self, field), field, self.task))
         covered = sorted(entry for agent in self.action_index for entry in agent)
         if covered != list(range(len(self.action_low))):
             raise TaskError(
@@ -159,15 +180,14 @@ class EnvSpec:
                 "action entry."
             )
         if len(self.action_high) != len(self.action_low) or not all(
-            np.isfinite((low, high)).all() and low < high
+            abs(low) <= LARGEST and abs(high) <= LARGEST and np.float32(low) < np.float32(high)
             for low, high in zip(self.action_low, self.action_high, strict=True)
         ):
             raise TaskError(
-                f"Task {self.task}: action_low and action_high must be finite, of equal length, "
-                "and low below high."
+                f"Task {self.task}: action_low and action_high must be of equal length, no larger "
+                f"than {LARGEST:g}, and low below high, in 32 bits too; they are "
+                f"{self.action_low} and {self.action_high}."
             )
-        if self.episode_limit < 1:
-            raise TaskError(f"Task {self.task}: episode_limit must be at least 1.")
 
     @property
     def n_agents(self) -> int:
@@ -228,6 +248,54 @@ class EnvSpec:
         return gather
 
 
+def _keep(spec: Any, field: str, value: Any) -> None:
+    object.__setattr__(spec, field, value)  # frozen, but not yet seen by anybody
+
+
+def _name(task: Any) -> str:
+    if not isinstance(task, str) or not task:
+        raise TaskError(f"The name of a task must be a text, and it is {task!r}.")
+    return task
+
+
+def _whole(value: Any, field: str, task: str, least: int) -> int:
+    """A whole number, of Python or numpy."""
+    try:
+        number = least - 1 if isinstance(value, bool) else operator.index(value)
+    except TypeError:
+        number = least - 1
+    if number < least:
+        raise TaskError(
+            f"Task {task}: {field} is {value!r}, but must be a whole number of at least {least}"
+            f"{f': write {value:.0f}' if isinstance(value, float) and value >= least else ''}."
+        )
+    return number
+
+
+def _indices(value: Any, field: str, task: str) -> tuple[tuple[int, ...], ...]:
+    try:
+        agents = [tuple(agent) for agent in _several(value)]
+    except TypeError as error:
+        raise TaskError(
+            f"Task {task}: {field} is {value!r}, but must name the entries of each agent, such as "
+            "[(0, 1), (2,)] of two agents."
+        ) from error
+    return tuple(tuple(_whole(e, f"an entry of {field}", task, 0) for e in a) for a in agents)
+
+
+def _bounds(value: Any, field: str, task: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(bound) for bound in _several(value))
+    except (TypeError, ValueError) as error:
+        raise TaskError(f"Task {task}: {field} is {value!r}, but must be numbers.") from error
+
+
+def _several(value: Any) -> Iterable[Any]:
+    if isinstance(value, str | bytes | dict):
+        raise TypeError("no list")
+    return iter(value)
+
+
 def _padded(index: tuple[tuple[int, ...], ...], size: int) -> NDArray[np.int32]:
     return np.array([[*agent, *[0] * (size - len(agent))] for agent in index], np.int32)
 
@@ -244,15 +312,30 @@ class DiscreteSpec:
         n_actions: actions that each agent has to choose from; not all are always available.
         episode_limit: steps after which an episode ends.
         has_wins: whether an episode can be won, which ``info["battle_won"]`` of a step tells.
+
+    Raises:
+        TaskError: if a size is no whole number of at least 1.
     """
 
-    task: str
-    n_agents: int
-    obs_size: int
-    state_size: int
-    n_actions: int
-    episode_limit: int
-    has_wins: bool = False
+    task: Name
+    n_agents: Whole
+    obs_size: Whole
+    state_size: Whole
+    n_actions: Whole
+    episode_limit: Whole
+    has_wins: bool | Any = False
+
+    def __post_init__(self) -> None:
+        _keep(self, "task", _name(self.task))
+        for field in dataclasses.fields(self):
+            if field.name not in ("task", "has_wins"):
+                value = getattr(self, field.name)
+                _keep(self, field.name, _whole(value, field.name, self.task, least=1))
+        if not isinstance(self.has_wins, bool | np.bool_):
+            raise TaskError(
+                f"Task {self.task}: has_wins is {self.has_wins!r}, but must be True or False."
+            )
+        _keep(self, "has_wins", bool(self.has_wins))
 
     @property
     def action_mask(self) -> NDArray[np.bool_]:
@@ -297,12 +380,14 @@ class DiscreteTask(NamedTuple):
     ``make(render_mode)`` returns a `gymnasium.Env` whose observation is a dictionary of ``obs``
     [N, O], ``state`` [S] and ``avail_actions`` [N, n_actions], and whose action is one number per
     agent, [N]. ``render_mode`` is None or ``"rgb_array"``. ``device()``, where there is one,
-    returns the same task for rollouts on the device.
+    returns the same task for rollouts on the device. ``seeded`` is False where an environment has
+    no place for a seed, so that its episodes do not repeat.
     """
 
     spec: DiscreteSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
     device: Callable[[], DeviceEnv] | None = None
+    seeded: bool = True
 
 
 class Task(NamedTuple):
@@ -311,11 +396,13 @@ class Task(NamedTuple):
     ``make(render_mode)`` returns a `gymnasium.Env` whose observation is the global state, a
     float array of shape [S], and whose action is the joint action, shape [U], in its own units
     (between ``spec.action_low`` and ``spec.action_high``). Time limits are the environment's
-    ``truncated``. ``render_mode`` is None or ``"rgb_array"``.
+    ``truncated``. ``render_mode`` is None or ``"rgb_array"``. ``seeded`` is False where an
+    environment has no place for a seed, so that its episodes do not repeat.
     """
 
     spec: EnvSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
+    seeded: bool = True
 
 
 AnyTask = Task | DiscreteTask

@@ -1,5 +1,7 @@
 """The command line, called as a user calls it."""
 
+import re
+
 import pytest
 
 from race.cli import main
@@ -7,6 +9,11 @@ from race.cli import main
 
 def race(command: str) -> None:
     main(command.split())
+
+
+def alone(options: str) -> str:
+    """Options without those of a population, which methods without one refuse."""
+    return re.sub(r"--(race\.\S+|facmac\.value-size)( (?!--)\S+)*", "", options)
 
 
 def fails(command: str, capsys: pytest.CaptureFixture[str]) -> str:

@@ -11,6 +11,8 @@ from race.training.run_state import Progress
 from race.training.trainer import train
 
 TIMES = ("wall_seconds", "time/env_steps_per_second", "time/rollout_fraction")
+PASSING = (*TIMES, "run")
+"""What tells equal runs apart: times, and which of them it is."""
 
 
 class KilledError(Exception):
@@ -18,9 +20,9 @@ class KilledError(Exception):
 
 
 def rows(path: Path, kind: str = "") -> list[dict[str, Any]]:
-    """The rows of a run, or those of a kind, without wall-clock times."""
+    """The rows of a run, or those of a kind, without wall-clock times and its identity."""
     found = metrics.read(path / "metrics.jsonl")
-    timeless = [{k: v for k, v in row.items() if k not in TIMES} for row in found]
+    timeless = [{k: v for k, v in row.items() if k not in PASSING} for row in found]
     return [row for row in timeless if kind in ("", row["kind"])]
 
 

@@ -111,7 +111,9 @@ class EpisodeUpdates:
 def _measure_update(name: str, algo: Algo, shape: str) -> list[Measurement]:
     spec = SHAPES[shape]
     config = resolve(Config(spec.task, algo), discrete=True)
-    episodes = random_episodes(spec, 2 * config.facmac.batch_size, config.facmac.replay_precision)
+    episodes = random_episodes(
+        spec, 2 * config.facmac.batch_size, str(config.facmac.replay_precision)
+    )
     updates = EpisodeUpdates(config, spec, episodes)
     # A generation of the baseline is one episode, and so one step.
     steps = STEPS if config.has_population else 1

@@ -84,11 +84,11 @@ def _bytes_of_episodes() -> int:
 
     spec = make_discrete_task(f"micro/{MAP}").spec
     config = resolve(Config(spec.task, "facmac"), discrete=True)
-    rows = random_episodes(spec, 50, config.facmac.replay_precision)
+    rows = random_episodes(spec, 50, str(config.facmac.replay_precision))
     updates = EpisodeUpdates(config, spec, rows)
     jax.block_until_ready(updates(1))
     before = _now()
-    item = empty_episode(spec, config.facmac.replay_precision)
+    item = empty_episode(spec, str(config.facmac.replay_precision))
     replay = init_replay(item, config.facmac.replay_capacity)
     for _ in range(config.facmac.replay_capacity // 50):
         replay = programs.store(replay, rows, np.int32(50))

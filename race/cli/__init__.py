@@ -9,7 +9,8 @@ import sys
 import time
 
 from race import __version__
-from race.errors import RaceError
+from race.cli import streams
+from race.errors import RaceError, say
 
 _BEGAN = time.perf_counter()
 
@@ -25,11 +26,11 @@ COMMANDS = {
     "doctor": "show what is installed, what is missing and how to mend it",
 }
 
-_OUT_OF_MEMORY = (
-    "this machine does not have the memory for it. Use smaller networks or batches "
-    "(--learner.hidden-sizes, --learner.batch-size) or a smaller buffer "
-    "(--learner.replay-capacity). On tasks with discrete actions these are --facmac.hidden-size, "
-    "--facmac.batch-size and --facmac.replay-capacity."
+_OUT_OF_MEMORY = "this machine does not have the memory for it."
+_SMALLER = (
+    " Use smaller networks or batches (--learner.hidden-sizes, --learner.batch-size) or a smaller "
+    "buffer (--learner.replay-capacity). On tasks with discrete actions these are "
+    "--facmac.hidden-size, --facmac.batch-size and --facmac.replay-capacity."
 )
 
 _EXAMPLE = """\
@@ -44,6 +45,24 @@ For example:
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a command. Exits with 0, 1 (failed, with a message), 2 (bad usage) or 130 (Ctrl-C)."""
+    streams.prepare()
+    try:
+        _run(arguments)
+    except BrokenPipeError:  # the reader of our output, such as `head`, has gone
+        streams.silence(sys.stdout)
+        sys.exit(141)
+    except OSError as error:
+        streams.silence(sys.stdout)
+        say(f"race: the output could not be written: {error}.")
+        sys.exit(1)
+    finally:
+        failure = streams.finish()
+    if failure is not None:
+        say(f"race: the output could not be written: {failure}.")
+        sys.exit(1)
+
+
+def _run(arguments: list[str] | None) -> None:
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help"):
         print(_overview())
@@ -55,28 +74,36 @@ def main(arguments: list[str] | None = None) -> None:
     if command not in COMMANDS:
         near = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f" Did you mean `race {near[0]}`?" if near else ""
-        print(f"race: there is no command {command!r}.{hint}\n\n{_overview()}", file=sys.stderr)
+        say(f"race: there is no command {command!r}.{hint}\n\n{_overview()}")
         sys.exit(2)
     try:
         importlib.import_module(f"race.cli.{command}").main(rest)
-    except RaceError as error:
-        print(f"race {command}: {error}", file=sys.stderr)
-        sys.exit(1)
-    except MemoryError:
-        print(f"race {command}: {_OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(1)
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):  # what JAX calls it
-            raise
-        print(f"race {command}: {_OUT_OF_MEMORY}", file=sys.stderr)
-        sys.exit(1)
     except KeyboardInterrupt:
-        print(f"\nrace {command}: interrupted.", file=sys.stderr)
+        say(f"\nrace {command}: interrupted.")
         sys.exit(130)
-    except BrokenPipeError:
-        # The reader of our output, such as `head`, has gone.
-        sys.stderr.close()
-        sys.exit(141)
+    except Exception as error:
+        told = _told(command, error)
+        if told is None:  # a mistake of ours: its traceback is what helps
+            raise
+        say(f"race {command}: {told}")
+        sys.exit(1)
+
+
+def _told(command: str, error: Exception) -> str | None:
+    """What a user is told of an error; None if it is none of theirs or of their machine's."""
+    out_of_memory = _OUT_OF_MEMORY + (_SMALLER if command in ("train", "resume") else "")
+    match error:
+        case BrokenPipeError():
+            return None
+        case RaceError():
+            return str(error)
+        case MemoryError():
+            return out_of_memory
+        case OSError():
+            return f"{error}. See that the disk is not full and that files can be read and written."
+        case RuntimeError() if "RESOURCE_EXHAUSTED" in str(error):  # what JAX calls it
+            return out_of_memory
+    return None
 
 
 def seconds_since_start() -> float:

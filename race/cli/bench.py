@@ -26,14 +26,14 @@ class Bench:
 def main(arguments: list[str]) -> None:
     """Parses the arguments, measures and prints."""
     asked = tyro.cli(Bench, args=arguments, prog="race bench")
-    from rich.console import Console
     from rich.progress import Progress
     from rich.table import Table
 
     from race.bench import suite
+    from race.cli import streams
 
     subjects = suite.chosen(suite.subjects(), asked.only)
-    console = Console(stderr=True)
+    console = streams.console(stderr=True)
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=len(subjects))
 
@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> None:
             index = subjects.index(subject)
             bar.update(task, completed=index, description=first)
             if not console.is_terminal:
-                console.print(f"{index + 1}/{len(subjects)} {first}", highlight=False)
+                console.print(f"{index + 1}/{len(subjects)} {first}")
 
         results = suite.measure(subjects, asked.only, begins)
     if asked.json:
@@ -58,4 +58,4 @@ def main(arguments: list[str]) -> None:
         verdict = {None: "", True: "met", False: "not met"}[result.met]
         value = f"{result.value:,.0f}" if result.value >= 1000 else f"{result.value:.3g}"
         table.add_row(result.name, f"{value} {result.unit}", goal, verdict)
-    Console().print(table)
+    streams.console().print(table)

@@ -17,24 +17,30 @@ class Doctor:
 def main(arguments: list[str]) -> None:
     """Looks and prints."""
     tyro.cli(Doctor, args=arguments, prog="race doctor")
-    from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
+    from race.cli import streams
     from race.compilation import cache_directory
     from race.doctor import examine
 
-    console = Console()
+    console = streams.console()
     table = Table("", "what", "found", box=None)
-    marks = {"ok": "[green]ok[/]", "warning": "[yellow]note[/]", "missing": "[red]missing[/]"}
+    marks = {
+        "ok": Text("ok", "green"),
+        "warning": Text("note", "yellow"),
+        "missing": Text("missing", "red"),
+    }
     findings = []
-    with Console(stderr=True).status("looking"):
+    with streams.console(stderr=True).status("looking"):
         for finding in examine(cache_directory()):
             findings.append(finding)
             table.add_row(marks[finding.status], finding.name, finding.detail)
     console.print(table)
     remedies = [f for f in findings if f.remedy and f.status != "ok"]
     for finding in remedies:
-        console.print(f"To mend {finding.name}: [bold]{finding.remedy}[/]", soft_wrap=True)
+        remedy = Text.assemble(f"To mend {finding.name}: ", (finding.remedy, "bold"))
+        console.print(remedy, soft_wrap=True)
     if any(finding.status == "missing" for finding in findings):
         sys.exit(1)
     console.print("Everything that race needs is here.")

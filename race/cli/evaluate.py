@@ -8,9 +8,11 @@ from typing import Annotated
 
 import tyro
 
+from race.cli import streams
 from race.config.settings import TeamName
 from race.errors import ConfigError
 
+MOST_EPISODES = 1_000_000
 BATCH = 32
 """Episodes played at the same time."""
 
@@ -38,12 +40,14 @@ class Evaluate:
 def main(arguments: list[str]) -> None:
     """Parses the arguments, plays and prints."""
     chosen = tyro.cli(Evaluate, args=arguments, prog="race evaluate")
-    if chosen.episodes < 1:
-        raise ConfigError(f"--episodes is {chosen.episodes}, but it must be at least 1.")
-    if chosen.seed < 0:
-        raise ConfigError(f"--seed is {chosen.seed}, but it must be 0 or more.")
+    if not 1 <= chosen.episodes <= MOST_EPISODES:
+        raise ConfigError(
+            f"--episodes is {chosen.episodes}, but it must be at least 1 and at most "
+            f"{MOST_EPISODES}."
+        )
+    if not 0 <= chosen.seed < 2**63:
+        raise ConfigError(f"--seed is {chosen.seed}, but it must be from 0 to {2**63 - 1}.")
     import numpy as np
-    from rich.console import Console
     from rich.progress import Progress
 
     from race.cli.progress import rounded
@@ -60,7 +64,7 @@ def main(arguments: list[str]) -> None:
     parts: list[Score] = []
     with (
         rollouts_of(trained.config, trained.task) as rollouts,
-        Progress(console=Console(stderr=True), transient=True) as bar,
+        Progress(console=streams.console(stderr=True), transient=True) as bar,
     ):
         playing = bar.add_task("playing", total=len(seeds))
         for batch in batches:

@@ -50,10 +50,11 @@ def main(arguments: list[str]) -> None:
         }
         print(json.dumps(listing, indent=2))
         return
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    from race.cli import streams
+
+    console = streams.console()
     table = Table("task", "in the paper", "alpha", "beta", "what it is", title="Tasks")
     table.columns[0].no_wrap = True
     for info in tasks:

@@ -58,7 +58,7 @@ class TrainingDisplay:
         )
         if "eval/selected/return_mean" in row:
             self._test = test_summary(row)
-            self._console.print(self._line(row), highlight=False, soft_wrap=True)
+            self._console.print(self._line(row), soft_wrap=True)
 
     def _details(self, progress: Progress, covered: float) -> str:
         now = time.monotonic()

@@ -8,11 +8,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import tyro
 
+from race.cli import streams
 from race.config.settings import TeamName
-from race.errors import ConfigError, RenderError, blamed
+from race.errors import ConfigError, RenderError
 
 PolicyName = Literal["scripted", "random", "nearest", "heuristic"]
 _SECONDS = 15.0
+MOST_SECONDS = 100_000
 STEPS_PER_SECOND = 2
 """Of a battle, at the game's "normal" speed."""
 
@@ -66,8 +68,10 @@ def main(arguments: list[str]) -> None:
     if out.suffix.lower() not in (".mp4", ".gif"):
         raise RenderError(f"{out} is no video: the name must end with .mp4 or .gif.")
     asked = chosen.seconds
-    if chosen.seed < 0 or (asked is not None and not 0 <= asked < float("inf")):
-        raise ConfigError("--seed and --seconds must be 0 or more.")
+    if chosen.seed < 0 or (asked is not None and not 0 <= asked <= MOST_SECONDS):
+        raise ConfigError(
+            f"--seed and --seconds must be 0 or more, and --seconds at most {MOST_SECONDS}."
+        )
     if battle:
         _render_battle(chosen, out, asked or 0.0)
     else:
@@ -82,15 +86,13 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         )
     if chosen.seed >= 2**32:
         raise ConfigError(f"The --seed of a battle must be below {2**32}.")
-    from rich.console import Console
-
     from race.compilation import use_cache
     from race.envs.micro import make
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
 
     use_cache()
-    console, policy = Console(stderr=True), chosen.policy or "scripted"
+    console, policy = streams.console(stderr=True), chosen.policy or "scripted"
     with console.status("playing the battle"):
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
@@ -99,17 +101,17 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
 
 
 def _render_run(chosen: Render, out: Path) -> None:
+    if chosen.seed >= 2**31:
+        raise ConfigError(f"The --seed of an episode must be below {2**31}.")
     if chosen.policy is not None:
         raise ConfigError(
             f"--policy is for battles such as micro/2s3z, and {chosen.what} is the directory of a "
             "run: leave it out, or choose one of the run's teams with --team."
         )
-    from rich.console import Console
-
     from race.compilation import use_cache
     from race.runs import directory as run_directory
 
-    console = Console(stderr=True)
+    console = streams.console(stderr=True)
     discrete = run_directory.open_run(Path(chosen.what)).discrete
     renderer = None
     if not discrete:
@@ -118,7 +120,7 @@ def _render_run(chosen: Render, out: Path) -> None:
 
         with console.status("looking for a renderer"):
             renderer = choose_renderer()
-        console.print(f"Drawing with: {renderer.reason}", highlight=False, soft_wrap=True)
+        console.print(f"Drawing with: {renderer.reason}", soft_wrap=True)
     from race.teams.trained import load_trained
 
     use_cache()
@@ -148,7 +150,7 @@ def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> 
     policy = trained.policy(chosen.team or "selected")
     episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
     return _Drawn(
-        _guarded(episode.frames()),
+        episode.frames(),
         episode.n_frames,
         episode.fps,
         lambda: (episode.steps, episode.episode_return, ""),
@@ -156,31 +158,38 @@ def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> 
 
 
 def _draw_discrete(chosen: Render, trained: Any, seconds: float, out: Path, console: Any) -> _Drawn:
-    """The episode is played without pictures first, then its actions again with them."""
+    if trained.config.task.startswith("micro/"):
+        return _battle_of_run(chosen, trained, seconds, out, console)
+    from race.viewing.stepwise import DiscreteEpisode
+
+    policy = trained.recurrent_policy(chosen.team or "selected")
+    episode = DiscreteEpisode(
+        trained.task, lambda seen: policy(seen.obs, seen.avail_actions), chosen.seed, seconds
+    )
+    return _Drawn(
+        episode.frames(),
+        episode.n_frames,
+        episode.fps,
+        lambda: (episode.steps, episode.episode_return, ""),
+    )
+
+
+def _battle_of_run(chosen: Render, trained: Any, seconds: float, out: Path, console: Any) -> _Drawn:
+    """A battle is a function of its seed and the actions, so it can be played twice."""
+    from race.envs.micro import make
+    from race.envs.micro.recording import replay
     from race.rollouts.discrete import EpisodeRollouts
 
-    task = trained.config.task
-    if chosen.seed >= 2**31:
-        raise ConfigError(f"The --seed of an episode must be below {2**31}.")
     head = trained.heads[trained.resolve(chosen.team or "selected")]
-    # Without somebody to draw, there is nothing to play either.
-    with blamed(RenderError, "The environment failed when it was made for pictures"):
-        env = trained.task.make("rgb_array") if not task.startswith("micro/") else None
     with (
         console.status("playing the episode"),
         EpisodeRollouts(trained.config, trained.task) as rollouts,
     ):
         actions = rollouts.episode(trained.encoder, head, chosen.seed)
-    if env is not None:
-        steps = len(actions) if seconds == 0 else math.ceil(seconds * STEPS_PER_SECOND)
-        return _stepwise(env, actions[:steps], chosen.seed)
-    from race.envs.micro import make
-    from race.envs.micro.recording import replay
-
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     with console.status("playing it again"):
-        played = make(task.removeprefix("micro/"))
+        played = make(trained.config.task.removeprefix("micro/"))
         recording = replay(played, actions, chosen.seed)
     return _recorded(played, recording, out)
 
@@ -196,32 +205,6 @@ def _recorded(played: Any, recording: Any, out: Path) -> _Drawn:
         render.FPS,
         lambda: (len(recording.returns), float(recording.returns[-1]), ended),
     )
-
-
-def _stepwise(env: Any, actions: Any, seed: int) -> _Drawn:
-    total, steps = 0.0, 0
-
-    def frames() -> Iterator[Any]:
-        nonlocal total, steps
-        try:
-            env.reset(seed=seed)
-            yield env.render()
-            for action in actions:
-                _, reward, terminated, truncated, _ = env.step(action)
-                total, steps = total + float(reward), steps + 1
-                yield env.render()
-                if terminated or truncated:
-                    break
-        finally:
-            env.close()
-
-    fps = float(env.metadata.get("render_fps") or STEPS_PER_SECOND)
-    return _Drawn(_guarded(frames()), len(actions) + 1, fps, lambda: (steps, total, ""))
-
-
-def _guarded(frames: Iterator[Any]) -> Iterator[Any]:
-    with blamed(RenderError, "The environment failed while it was drawn"):
-        yield from frames
 
 
 def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:

@@ -22,6 +22,9 @@ class Resume:
     """The run's directory, or that of several seeds."""
     env_steps: int | None = None
     """Train up to this many environment steps instead of what the run began with."""
+    without_metrics: bool = False
+    """Go on although the rows of metrics.jsonl are lost or damaged: the file is put aside and a new
+    one begins, which says so."""
     jobs: int | None = None
     """If DIR holds the runs of several seeds: so many at a time. None: as many as cores, or one on
     an accelerator."""
@@ -37,6 +40,8 @@ def main(arguments: list[str]) -> None:
     from race.runs.directory import RunDirectory
 
     if not RunDirectory(chosen.run_dir).config.exists() and directories_of(chosen.run_dir):
+        if chosen.without_metrics:
+            raise ConfigError("--without-metrics is for one run: name the seed's directory.")
         run_all(chosen.run_dir, chosen.jobs, chosen.env_steps)
         return
     if chosen.jobs is not None:
@@ -44,4 +49,9 @@ def main(arguments: list[str]) -> None:
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))
-    run(chosen.run_dir, config, extend=chosen.env_steps is not None)
+    run(
+        chosen.run_dir,
+        config,
+        extend=chosen.env_steps is not None,
+        without_metrics=chosen.without_metrics,
+    )

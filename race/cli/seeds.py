@@ -5,7 +5,6 @@ start and a later one are the same thing.
 """
 
 import dataclasses
-import json
 import os
 import signal
 import subprocess
@@ -20,13 +19,17 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
+from race.cli import streams
 from race.cli.progress import duration, test_summary
 from race.config.presets import resolve
 from race.config.settings import Config
-from race.errors import ConfigError, RunDirectoryError
+from race.errors import ConfigError, RunDirectoryError, command
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
+from race.runs.sealed import parse
 
+MOST_SEEDS = 1000
+"""Runs of one command: more is a slip of the hand."""
 LOOK_EVERY = 0.5
 """Seconds between two looks at the runs."""
 _INTERRUPTED = 130
@@ -49,14 +52,17 @@ def parse_seeds(text: str) -> list[int]:
     try:
         for part in text.split(","):
             first, dash, last = part.strip().partition("-")
-            numbers = range(int(first), int(last if dash else first) + 1)
-            if not numbers:
-                raise ValueError("an empty range")
-            seeds += numbers
+            begin, end = int(first), int(last if dash else first)
+            if not 0 <= end - begin < MOST_SEEDS:
+                raise ValueError("an empty range, or an endless one")
+            seeds += range(begin, end + 1)
     except ValueError as error:
         raise ConfigError(
-            f"--seeds is {text!r}, but it must be like 1-5, or 1,4,7, or 1-3,9."
+            f"--seeds is {text!r}, but it must be like 1-5, or 1,4,7, or 1-3,9, "
+            f"and name at most {MOST_SEEDS} seeds."
         ) from error
+    if len(seeds) > MOST_SEEDS:
+        raise ConfigError(f"--seeds is {text!r}, which names more than {MOST_SEEDS} seeds.")
     if len(set(seeds)) < len(seeds):
         raise ConfigError(f"--seeds is {text!r}, which names a seed twice.")
     return seeds
@@ -130,7 +136,7 @@ class Worker:
         found = []
         for line in whole.splitlines():
             try:  # a damaged line is for the run itself to complain of
-                found.append(json.loads(line))
+                found.append(parse(line))
             except ValueError:
                 continue
         return [row for row in found if isinstance(row, dict) and "env_steps" in row]
@@ -157,6 +163,8 @@ class _Signals:
 
     def __enter__(self) -> "_Signals":
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) == signal.SIG_IGN:  # as under nohup
+                continue
             self._previous[number] = signal.signal(number, self._pass_on)
         return self
 
@@ -200,7 +208,7 @@ def run_all(
         ConfigError: if there would be no job at a time, or nothing to extend.
     """
     check_jobs(jobs)
-    console = console or Console()
+    console = console or streams.console(tolerant=True)
     if env_steps is not None:
         _extend(path, env_steps)
     workers = [Worker(run, run_directory.open_run(run)) for run in directories_of(path)]
@@ -223,13 +231,13 @@ def run_all(
                 continue
             for worker in [worker for worker in workers if worker.process is not None]:
                 for row in worker.look():
-                    console.print(_line(worker, row), highlight=False, soft_wrap=True)
+                    console.print(_line(worker, row), soft_wrap=True)
                 if worker.process is None:
                     if signals.requested and worker.ended == "failed":
                         # Stopped before it could listen; nothing is lost.
                         worker.ended = "interrupted"
                     free.append(worker.core)
-                    console.print(f"seed {worker.config.seed}: {worker.stage}", highlight=False)
+                    console.print(f"seed {worker.config.seed}: {worker.stage}")
             live.update(_table(workers))
             if not any(w.process for w in workers) and (signals.requested or not waiting):
                 break
@@ -274,11 +282,11 @@ def _say_how_it_ended(path: Path, workers: Sequence[Worker], console: Console) -
             "\n".join(f"Seed {w.config.seed} failed, in {w.path}: {w.complaint()}" for w in failed)
         )
     if any(worker.ended != "finished" for worker in workers):
-        message = f"Interrupted and saved. Go on with: race resume {path}"
-        console.print(message, highlight=False, soft_wrap=True)
+        message = f"Interrupted and saved. Go on with: {command('race', 'resume', path)}"
+        console.print(message, soft_wrap=True)
         sys.exit(_INTERRUPTED)
-    message = f"All {len(workers)} seeds have finished. Next: race plot {path} --out curves.png"
-    console.print(message, highlight=False, soft_wrap=True)
+    plot = command("race", "plot", path, "--out", "curves.png")
+    console.print(f"All {len(workers)} seeds have finished. Next: {plot}", soft_wrap=True)
 
 
 def _line(worker: Worker, row: dict[str, Any]) -> str:

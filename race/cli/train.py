@@ -2,13 +2,13 @@
 
 import dataclasses
 import os
-from collections.abc import Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from race.config.effects import refuse_without_effect
 from race.config.presets import PRESETS, resolve
 from race.config.settings import (
     Algo,
@@ -22,8 +22,8 @@ from race.config.settings import (
     Preset,
     RaceConfig,
 )
-from race.errors import ConfigError, RunDirectoryError
-from race.types import DiscreteTask
+from race.errors import ConfigError, RunDirectoryError, command, say
+from race.types import AnyTask, DiscreteTask
 
 
 @dataclass(frozen=True)
@@ -77,31 +77,51 @@ def main(arguments: list[str]) -> None:
     )
     # Not before the arguments are parsed: these take a second to import.
     from race.cli.seeds import SHARED_ACCELERATOR, run_all
-    from race.cli.training import describe, run
+    from race.cli.training import run
+    from race.compilation import use_cache
     from race.envs import make_task
+    from race.envs.description import describe
     from race.runs import directory as run_directory
 
     if chosen.seeds is not None:  # this process only watches
         os.environ.update(SHARED_ACCELERATOR)
+    use_cache()
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)
-    _refuse_without_effect(asked, chosen.preset, discrete)
+    _refuse_without_effect(asked, chosen.preset, task)
     config = resolve(asked, discrete=discrete)
     if chosen.seeds is None:
         if chosen.jobs is not None:
             raise ConfigError("--jobs has no effect without --seeds. Leave it out.")
         path = chosen.run_dir or Path("runs") / f"{_name(config)}-seed{config.seed}"
-        run_directory.create(path, config, describe(task))
+        run_directory.refuse_occupied(path)
+        run_directory.create(path, config, describe(task) | _tried(asked.task, task))
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / _name(config)
-    _create_all(path, config, chosen, describe(task))
+    _create_all(path, config, chosen, task)
     run_all(path, chosen.jobs)
 
 
-def _create_all(path: Path, config: Config, chosen: Train, described: dict[str, Any]) -> None:
+def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
+    """What a first look at an environment of the user's own says; others repeat."""
+    from race.cli import streams
+    from race.envs.own import is_own
+    from race.envs.trial import try_out
+
+    if not is_own(task_id):
+        return {"repeats": True}
+    with streams.console(stderr=True).status("trying the environment"):
+        trial = try_out(task)
+    if trial.note:
+        say(trial.note)
+    return {"repeats": trial.repeats}
+
+
+def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:
     """Makes the run directories of several seeds, or none."""
     from race.cli.seeds import check_jobs, parse_seeds
+    from race.envs.description import describe
     from race.runs import directory as run_directory
 
     seeds = parse_seeds(str(chosen.seeds))
@@ -113,9 +133,11 @@ def _create_all(path: Path, config: Config, chosen: Train, described: dict[str, 
     for place in (path, *places):
         if (place / "config.json").exists():
             raise RunDirectoryError(
-                f"{place} already holds a run. Go on with all runs of {path} by `race resume "
-                f"{path}`, or choose another directory with `--run-dir`."
+                f"{place} already holds a run. Go on with all runs of {path} by "
+                f"`{command('race', 'resume', path)}`, or choose another directory with "
+                "`--run-dir`."
             )
+    described = describe(task) | _tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
 
@@ -127,36 +149,23 @@ def _parse(arguments: list[str]) -> Train:
     return tyro.cli(Train, args=arguments, prog="race train", default=default)
 
 
-def _refuse_without_effect(asked: Config, preset: Preset, discrete: bool) -> None:
-    """Settings that would not be used are mistakes, and costly ones if not told."""
+def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None:
+    from race.envs import reads_config
+
+    discrete = isinstance(task, DiscreteTask)
     if discrete and preset != "paper":
         raise ConfigError(
             f"--preset {preset} has no effect on {asked.task}: its actions are discrete, and the "
             "presets are of learners of continuous actions. Leave it out; --facmac.* are the "
             "settings of the learner on this task."
         )
-    if discrete:
-        unused = _changed("learner", asked.learner, LearnerConfig())
-        if ":" not in asked.task:  # a task of the user's own is given these settings
-            unused += _changed("env", asked.env, EnvConfig())
-        kind, instead = "discrete", "--facmac.*"
-    else:
-        # The mixer is all that FACMAC shares with its form for continuous actions.
-        mixes = "facmac" in (asked.algo, asked.base)
-        used = {"mixer_size", "hypernet_size"} if mixes else set()
-        unused = _changed("facmac", asked.facmac, FacmacConfig(), used)
-        kind, instead = "continuous", "--learner.*"
-    if unused:
-        raise ConfigError(
-            f"{' and '.join(unused)} would have no effect on {asked.task}. Its actions are {kind}; "
-            f"the settings of its learner are {instead}. Leave out what has no effect."
-        )
-
-
-def _changed(group: str, asked: Any, default: Any, used: Set[str] = frozenset()) -> list[str]:
-    names = [f.name for f in dataclasses.fields(asked) if f.name not in used]
-    changed = [name for name in names if getattr(asked, name) != getattr(default, name)]
-    return [f"--{group}.{name.replace('_', '-')}" for name in changed]
+    refuse_without_effect(
+        asked,
+        PRESETS[preset],
+        discrete=discrete,
+        reads_env=reads_config(asked.task),
+        on_host=not isinstance(task, DiscreteTask) or task.device is None,
+    )
 
 
 def _name(config: Config) -> str:

@@ -5,13 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from race.config.settings import Config, FacmacConfig
+from race.config.settings import Config, EnvConfig, FacmacConfig
 from race.errors import ConfigError
 
 LARGEST_LAYER = 16_384
 """Units of a layer, samples of a batch, teams: more is a slip of the hand."""
 MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
+MOST_JOINTS = 1000
+"""Joints between an agent and what it observes: no robot has as many."""
 
 
 Rule = tuple[bool, str, Any, str]
@@ -164,7 +166,7 @@ def check(config: Config) -> None:
             "at least 1",
         ),
         (race.mine_size >= 1, "race.mine-size", race.mine_size, "at least 1"),
-        (config.env.agent_obsk >= 0, "env.agent-obsk", config.env.agent_obsk, "0 or more"),
+        *_env_rules(config.env),
         (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
         (
             config.evaluation.episodes >= 1,
@@ -185,6 +187,30 @@ def check(config: Config) -> None:
             raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
         if not holds:
             raise ConfigError(f"--{name} is {value}, but it must be {must}.")
+
+
+def _env_rules(env: EnvConfig) -> list[Rule]:
+    return [
+        (
+            0 <= env.agent_obsk <= MOST_JOINTS,
+            "env.agent-obsk",
+            env.agent_obsk,
+            f"0 to {MOST_JOINTS}",
+        ),
+        (0 <= env.retries <= 1000, "env.retries", env.retries, "0 to 1000"),
+        (
+            env.step_seconds is None or 0 < env.step_seconds <= 1e6,
+            "env.step-seconds",
+            env.step_seconds,
+            "above 0, at most 1000000, or None for no limit",
+        ),
+        (
+            env.step_seconds is None or env.processes is not False,
+            "env.step-seconds",
+            env.step_seconds,
+            "left out with --env.processes False: only a process of its own can be ended",
+        ),
+    ]
 
 
 def _facmac_rules(facmac: FacmacConfig, n_teams: int) -> list[Rule]:

@@ -3,7 +3,7 @@
 import dataclasses
 
 from race.config.checks import check
-from race.config.settings import Base, Config, LearnerConfig
+from race.config.settings import Base, Config, LearnerConfig, ReplayPrecision
 
 # Table 3: (alpha, beta) of RACE(MATD3) on Multi-Agent MuJoCo.
 TABLE_3: dict[str, tuple[float, float]] = {
@@ -72,11 +72,21 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
     if evaluation.episodes is None:
         evaluation = dataclasses.replace(evaluation, episodes=32 if discrete else 10)
     base: Base = config.algo if config.algo != "race" else config.base or _usual_base(discrete)
+    facmac = config.facmac
+    if facmac.replay_precision is None:
+        precision: ReplayPrecision = "float16" if config.task.startswith("micro/") else "float32"
+        facmac = dataclasses.replace(facmac, replay_precision=precision)
     learner = config.learner
     if base != "matd3":
         learner = dataclasses.replace(learner, policy_delay=1, smoothing_noise=0.0)
     config = dataclasses.replace(
-        config, race=race, base=base, discrete=discrete, learner=learner, evaluation=evaluation
+        config,
+        race=race,
+        base=base,
+        discrete=discrete,
+        learner=learner,
+        facmac=facmac,
+        evaluation=evaluation,
     )
     check(config)
     return config

@@ -98,8 +98,9 @@ class FacmacConfig:
     """Environment steps from the one to the other."""
     replay_capacity: int = 5_000
     """Episodes that the replay buffer holds."""
-    replay_precision: ReplayPrecision = "float16"
-    """What observations and states are stored as; float32 takes twice the memory."""
+    replay_precision: ReplayPrecision | None = None
+    """What observations and states are stored as; float32 takes twice the memory. None: float16 on
+    micro/*, whose numbers are about 1, else float32: float16 merges 10001 and 10002."""
     gradient_steps_per_episode: float = 1.0
     """Gradient steps for each episode collected, from the first full minibatch on."""
 
@@ -165,7 +166,13 @@ class EnvConfig:
     """Use gymnasium-robotics' own default observation instead of the three settings above."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
-    enough cores)."""
+    enough cores), and where steps have a time limit."""
+    retries: int = 3
+    """How often an episode is played anew in a fresh environment when its environment fails (an
+    error, a dead process, a step that takes too long), once the task has shown that it works."""
+    step_seconds: float | None = None
+    """Longest time of a step; environments then run in processes. None: no limit. Making and
+    resetting one may take ten times as long, at least a minute."""
 
 
 @dataclass(frozen=True)
@@ -239,6 +246,8 @@ _BEFORE: dict[str, Any] = {
     "layer_norm": False,
     "mutation_draw": "weight",
     "elite_copy": False,
+    "retries": 3,
+    "step_seconds": None,
 }
 
 

@@ -4,23 +4,16 @@ A family of tasks may be added or changed here; whoever trains sees `race.types.
 """
 
 import difflib
-import importlib
-import inspect
-import re
-import sys
 import tomllib
-from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
-
-import gymnasium
-import numpy as np
+from typing import Final, NamedTuple
 
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
-from race.envs import discrete_probe, mamujoco, probe
-from race.errors import TaskError, blamed
-from race.types import AnyTask, DiscreteTask, EnvSpec, Task
+from race.envs import discrete_probe, mamujoco, own, probe
+from race.envs.own import factorised
+from race.errors import TaskError
+from race.types import AnyTask, DiscreteTask, Task
 
 __all__ = [
     "TaskInfo",
@@ -29,6 +22,7 @@ __all__ = [
     "make_continuous_task",
     "make_discrete_task",
     "make_task",
+    "reads_config",
     "task_ids",
 ]
 
@@ -115,8 +109,8 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
     """
     if task_id.startswith(_MICRO):
         return make_discrete_task(task_id)
-    if re.fullmatch(r"[\w.]+:\w+", task_id):
-        return _own_task(task_id, config)
+    if own.is_own(task_id):
+        return own.own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
         return mamujoco.make_task(task_id, config)
     if task_id in probe.PROBES:
@@ -166,111 +160,8 @@ def make_discrete_task(task_id: str) -> DiscreteTask:
     )
 
 
-def _own_task(task_id: str, config: EnvConfig) -> AnyTask:
-    module_name, function_name = task_id.split(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise TaskError(
-                f"Task {task_id}: importing {module_name} failed, because it needs the module "
-                f"{error.name}, which is not installed."
-            ) from error
-        raise TaskError(
-            f"Task {task_id}: there is no module {error.name}. It is looked for in the current "
-            f"directory ({Path.cwd()}) and among the installed packages; the name is that of the "
-            "file without .py, with dots for folders."
-        ) from error
-    except Exception as error:
-        raise TaskError(
-            f"Task {task_id}: importing {module_name} failed with {type(error).__name__}: {error}."
-        ) from error
-    function = getattr(module, function_name, None)
-    if not callable(function):
-        raise TaskError(
-            f"Task {task_id}: {module_name} ({module.__file__}) has no function {function_name}. "
-            "Define one that returns a race.types.Task, for example with race.envs.factorised."
-        )
-    required = any(
-        parameter.default is parameter.empty
-        and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD)
-        for parameter in inspect.signature(function).parameters.values()
-    )
-    with blamed(TaskError, f"Task {task_id}: {function_name} failed"):
-        task = function(config) if required else function()
-    if not isinstance(task, Task | DiscreteTask):
-        raise TaskError(
-            f"Task {task_id}: {function_name} returned {type(task).__name__} instead of a "
-            "race.types.Task or DiscreteTask; race.envs.factorised builds the one from a gymnasium "
-            "environment, race.envs.pymarl.pymarl_task the other from a PyMARL-style one."
-        )
-    return task
-
-
-def factorised(
-    make: Callable[[str | None], gymnasium.Env[Any, Any]],
-    *,
-    obs_index: Sequence[Sequence[int]],
-    action_index: Sequence[Sequence[int]],
-    task: str,
-    episode_limit: int | None = None,
-) -> Task:
-    """A task out of a gymnasium environment: who sees which entries, who moves which.
-
-    Args:
-        make: ``make(render_mode)`` returns the environment, with an observation of shape [S] (the
-            global state) and an action of shape [U] (the joint action). Let it be a function of a
-            module: worker processes import it by name.
-        obs_index: for each agent, the entries of the state it observes.
-        action_index: for each agent, the entries of the joint action it moves; every entry must
-            belong to exactly one agent.
-        task: the name of the task.
-        episode_limit: steps after which the environment truncates an episode. None: the limit
-            that the environment was registered with. This describes the environment's own limit
-            and imposes none.
-
-    Raises:
-        TaskError: if spaces are not flat boxes, actions are unbounded, no limit is known, or the
-            indices do not fit.
-    """
-    env = make(None)
-    try:
-        state_size = _flat_box(env.observation_space, "observation", task).shape[0]
-        actions = _flat_box(env.action_space, "action", task)
-        if not (np.isfinite(actions.low).all() and np.isfinite(actions.high).all()):
-            raise TaskError(
-                f"Task {task}: the action space {actions} has no finite bounds. Give each entry a "
-                "lowest and a highest value, for example with gymnasium.wrappers.RescaleAction or "
-                "in the environment's Box."
-            )
-        if episode_limit is None:
-            episode_limit = env.spec.max_episode_steps if env.spec is not None else None
-        if episode_limit is None:
-            raise TaskError(
-                f"Task {task}: the environment is registered with no time limit. Wrap it in "
-                "gymnasium.wrappers.TimeLimit and pass the same number as episode_limit."
-            )
-    finally:
-        env.close()
-    spec = EnvSpec(
-        task=task,
-        state_size=state_size,
-        obs_index=tuple(tuple(map(int, agent)) for agent in obs_index),
-        action_index=tuple(tuple(map(int, agent)) for agent in action_index),
-        action_low=tuple(actions.low.tolist()),
-        action_high=tuple(actions.high.tolist()),
-        episode_limit=episode_limit,
-    )
-    return Task(spec, make)
-
-
-def _flat_box(space: Any, what: str, task: str) -> gymnasium.spaces.Box:
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
-        return space
-    raise TaskError(
-        f"Task {task}: the {what} space must be a Box with one axis, and it is {space}. "
-        "gymnasium.wrappers.FlattenObservation flattens observations; a task with discrete actions "
-        "is a race.types.DiscreteTask, which race.envs.pymarl.pymarl_task makes."
-    )
+def reads_config(task_id: str) -> bool:
+    """Whether a task that there is reads what agents observe from an `EnvConfig`."""
+    if own.is_own(task_id):
+        return own.takes_config(own.own_function(task_id))
+    return task_id.startswith("mamujoco/")

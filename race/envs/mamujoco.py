@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.config.settings import EnvConfig
+from race.envs import joints
 from race.errors import ConfigError, TaskError
 from race.types import EnvSpec, Task
 
@@ -174,10 +175,13 @@ def _single_agent_env(
 def _reference(
     env: gymnasium.Env[Any, Any], scenario: str, partition: str, config: EnvConfig
 ) -> Any:
-    """The library's multi-agent environment around `env`."""
+    """The library's multi-agent environment around `env`, its joints those of the model."""
     from gymnasium_robotics import mamujoco_v1
 
     options: dict[str, Any] = {}
+    obsk = 1 if config.library_observation else config.agent_obsk
+    unwrapped: Any = env.unwrapped
+    graph = joints.factorization(scenario, partition, obsk, unwrapped.model)
     if not config.library_observation:
         _check_categories(config)
         depths = range(config.agent_obsk + 1)
@@ -188,7 +192,9 @@ def _reference(
             "global_categories": tuple(config.global_categories),
         }
     try:
-        reference = mamujoco_v1.parallel_env(scenario, partition, gym_env=env, **options)
+        reference = mamujoco_v1.parallel_env(
+            scenario, partition, gym_env=env, agent_factorization=graph, **options
+        )
     except Exception as error:
         raise ConfigError(
             f"gymnasium-robotics cannot build these observations of {scenario} ({error}): "
@@ -197,8 +203,8 @@ def _reference(
         ) from error
     # The library sorts joints by name, and two joints of Pusher have the same one: their order
     # would differ from process to process.
-    for joints in (joints for near in reference.k_dicts for joints in near.values()):
-        joints.sort(key=lambda node: (node.label, node.act_ids))
+    for nodes in (nodes for near in reference.k_dicts for nodes in near.values()):
+        nodes.sort(key=lambda node: (node.label, node.act_ids))
     return reference
 
 

@@ -1,14 +1,17 @@
 """Environments with PyMARL's interface (SMAC's ``MultiAgentEnv``) as tasks.
 
 Such an environment has ``get_env_info``, ``reset``, ``get_obs``, ``get_state``,
-``get_avail_actions``, ``step(actions) -> reward, terminated, info`` and ``close``; the interface is
-that of github.com/oxwhirl/pymarl. It may have ``seed(seed)`` and ``render(mode="rgb_array")``.
+``get_avail_actions``, ``step(actions) -> reward, terminated, info`` and ``close``; the interface
+is that of github.com/oxwhirl/pymarl. It may have ``seed(seed)``, or take ``reset(seed=...)`` and
+answer a step with ``observation, reward, terminated, truncated, info`` as in EPyMARL, and have
+``render(mode="rgb_array")``.
 """
 
+import contextlib
 import functools
 import inspect
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Final, final
 
 import gymnasium
@@ -17,7 +20,9 @@ from gymnasium import spaces
 from jaxtyping import UInt8
 from numpy.typing import NDArray
 
-from race.errors import RenderError, TaskError
+from race.envs import contract
+from race.envs.checked import takes
+from race.errors import HandedOverError, RenderError, TaskError
 from race.types import DiscreteSpec, DiscreteTask
 
 _METHODS: Final = (
@@ -48,11 +53,21 @@ def pymarl_task(make: Callable[[], Any], task: str, *, has_wins: bool = False) -
     env = make()
     try:
         spec = _spec(env, task, has_wins)
+        seeded = _takes_seed(env)
     finally:
-        close = getattr(env, "close", None)
-        if callable(close):
-            close()
-    return DiscreteTask(spec, functools.partial(_make, make, task, has_wins))
+        with contextlib.suppress(Exception):  # it would hide what was wrong before
+            env.close()
+    made = functools.partial(_make, make, task, has_wins)
+    return DiscreteTask(spec, made, seeded=seeded)
+
+
+def _takes_seed(env: Any) -> bool:
+    return takes(getattr(env, "seed", None), 0) or _resets_with_seed(env)
+
+
+def _resets_with_seed(env: Any) -> bool:
+    # Named: one that takes any keyword may hand it on to one that does not.
+    return takes(env.reset, seed=0) and "seed" in inspect.signature(env.reset).parameters
 
 
 def _make(
@@ -97,8 +112,9 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
     An end that the environment calls ``info["episode_limit"]`` is ``truncated``: a learner
     bootstraps through it. Any other end is ``terminated``, a time limit too.
 
-    ``reset(seed=s)`` calls ``seed(s)`` of the environment if it has such a method. An environment
-    whose ``seed`` takes no argument (SMAC's only tells its seed) is given one where it is made.
+    ``reset(seed=s)`` calls ``seed(s)`` of the environment if it has such a method, and passes the
+    seed to its ``reset`` if that has a place for it. An environment whose ``seed`` takes no
+    argument (SMAC's only tells its seed) is given one where it is made.
 
     Attributes:
         sizes: the sizes, from ``get_env_info``.
@@ -135,7 +151,7 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
                 f"Task {task} can be rendered as 'rgb_array' or not at all (None), not as "
                 f"{render_mode!r}."
             )
-        if render_mode and not _takes(getattr(env, "render", None), mode=render_mode):
+        if render_mode and not takes(getattr(env, "render", None), mode=render_mode):
             raise RenderError(
                 f"Task {task} has no picture: {type(env).__name__} has no render that takes "
                 "mode='rgb_array'. Add one that returns an array [height, width, 3] of uint8."
@@ -166,9 +182,12 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         """
         super().reset(seed=seed)
         reseed = getattr(self._env, "seed", None)
-        if seed is not None and _takes(reseed, seed):
+        if seed is not None and takes(reseed, seed):
             reseed(seed)  # type: ignore[misc]
-        self._env.reset()
+        if seed is not None and _resets_with_seed(self._env):
+            self._env.reset(seed=seed)
+        else:
+            self._env.reset()
         self._steps, self._over = 0, False
         return self._observe(), {}
 
@@ -196,10 +215,12 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         offered = actions[:, None] == np.arange(spec.n_actions)[None]
         refused = ~(offered & (self._available == 1)).any(axis=1)
         taken = np.where(refused, self._available.argmax(axis=1), actions)
-        reward, ended, facts = self._answer(self._env.step(taken.tolist()))
-        self._steps, self._over = self._steps + 1, ended
-        if not ended and self._steps >= spec.episode_limit:
-            raise TaskError(
+        answer = self._env.step(taken.tolist())
+        self._steps += 1
+        reward, terminated, truncated, facts = self._answer(answer)
+        self._over = terminated or truncated
+        if not self._over and self._steps >= spec.episode_limit:
+            raise HandedOverError(
                 f"Task {spec.task}: the episode goes on after {self._steps} steps, though "
                 f"get_env_info says episode_limit {spec.episode_limit}. Let step return "
                 'terminated there, with info["episode_limit"] = True unless the limit is part of '
@@ -207,10 +228,11 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             )
         if spec.has_wins:
             # SMAC does not tell after its game broke down and had to be started again.
-            facts["battle_won"] = bool(facts.get("battle_won", False))
-        truncated = ended and bool(facts.get("episode_limit", False))
+            facts["battle_won"] = self._checked(
+                contract.truth, facts.get("battle_won", False), 'info["battle_won"]'
+            )
         facts["refused"] = refused
-        return self._observe(), reward, ended and not truncated, truncated, facts
+        return self._observe(), reward, terminated, truncated, facts
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
         """A picture of the environment as it stands; None without a render mode.
@@ -235,59 +257,48 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         """Closes the environment."""
         self._env.close()
 
-    def _answer(self, answer: Any) -> tuple[float, bool, dict[str, Any]]:
-        try:
-            reward, ended, facts = answer
-            return float(reward), bool(ended), dict(facts)
-        except (TypeError, ValueError) as error:
-            raise TaskError(
-                f"Task {self.sizes.task}: step must return (reward, terminated, info): a "
-                f"number for the team, a bool and a dictionary; it returned {answer!r}."
-            ) from error
+    def _answer(self, answer: Any) -> tuple[float, bool, bool, dict[str, Any]]:
+        """Reward, whether the task ended itself, whether an outer limit ended it, and facts."""
+        cut: Any = False
+        match answer:
+            case (reward, ended, Mapping() as facts):
+                pass
+            case (_, reward, ended, cut, Mapping() as facts):
+                pass
+            case _:
+                raise HandedOverError(
+                    f"Task {self.sizes.task}: step must return (reward, terminated, info): a "
+                    "number for the team, a bool and a dictionary, or EPyMARL's five values; it "
+                    f"returned {contract.came(answer)}."
+                )
+        worth = self._checked(contract.payment, reward)
+        over = self._checked(contract.truth, ended, "terminated")
+        truncated = self._checked(contract.truth, cut, "truncated")
+        limit = facts.get("episode_limit", False)
+        limited = self._checked(contract.truth, limit, 'info["episode_limit"]')
+        terminated = over and not limited
+        return worth, terminated, (over or truncated) and not terminated, dict(facts)
 
     def _observe(self) -> dict[str, Any]:
-        spec, env = self.sizes, self._env
-        n = spec.n_agents
-        observation = {
-            "obs": self._array("get_obs", env.get_obs(), (n, spec.obs_size)),
-            "state": self._array("get_state", env.get_state(), (spec.state_size,)),
+        spec, env, n = self.sizes, self._env, self.sizes.n_agents
+        obs, actions = (n, spec.obs_size), (n, spec.n_actions)
+        seen = {
+            "obs": self._checked(contract.numbers, env.get_obs(), obs, "what get_obs returned"),
+            "state": self._checked(
+                contract.numbers, env.get_state(), (spec.state_size,), "what get_state returned"
+            ),
         }
-        available = self._array("get_avail_actions", env.get_avail_actions(), (n, spec.n_actions))
-        if not np.isin(available, (0.0, 1.0)).all():
-            raise TaskError(
-                f"Task {spec.task}: get_avail_actions must say 1 or 0 of every action, available "
-                f"or not; after {self._steps} steps it returned {available.tolist()}."
-            )
-        idle = np.flatnonzero(~available.any(axis=1))
-        if len(idle):
-            raise TaskError(
-                f"Task {spec.task}: no action is available to agent {idle[0]} after "
-                f"{self._steps} steps. Give it one that does nothing, also when it is dead and "
-                "after the last step."
-            )
+        available = self._checked(
+            contract.mask, env.get_avail_actions(), actions, "what get_avail_actions returned"
+        )
+        self._checked(contract.refuse_idle, available)
         self._available = available.astype(np.int8)
-        return observation | {"avail_actions": self._available.copy()}
+        return seen | {"avail_actions": self._available.copy()}
 
-    def _array(self, method: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    def _checked(self, check: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            array = np.array(value, np.float32)  # a copy: environments may write to theirs again
-        except (TypeError, ValueError) as error:
-            raise TaskError(
-                f"Task {self.sizes.task}: {method} returned what is no array of numbers "
-                f"of shape {shape} ({error})."
+            return check(*arguments)
+        except HandedOverError as error:
+            raise HandedOverError(
+                f"Task {self.sizes.task}, after {self._steps} steps: {error}."
             ) from error
-        if array.shape != shape:
-            raise TaskError(
-                f"Task {self.sizes.task}: {method} returned shape {array.shape}, but "
-                f"get_env_info says {shape}. Let the two agree; agents whose observations or "
-                "actions are fewer are padded with zeros."
-            )
-        return array
-
-
-def _takes(function: Any, *args: Any, **kwargs: Any) -> bool:
-    try:
-        inspect.signature(function).bind(*args, **kwargs)
-    except (TypeError, ValueError):  # no function, other arguments, or none that can be known
-        return False
-    return True

@@ -10,11 +10,15 @@ from race.rollouts.transitions import TransitionRollouts
 from race.types import AnyTask, Task
 
 
-def rollouts_of(config: Config, task: AnyTask) -> Rollouts:
-    """The rollouts of a task, for a run of a resolved configuration."""
+def rollouts_of(config: Config, task: AnyTask, *, proven: bool = False) -> Rollouts:
+    """The rollouts of a task, for a run of a resolved configuration.
+
+    ``proven``: the run has played an episode before, so that an environment that fails is an
+    accident from the start.
+    """
     if isinstance(task, Task):
-        return TransitionRollouts(config, task)
-    return EpisodeRollouts(config, task)
+        return TransitionRollouts(config, task, proven=proven)
+    return EpisodeRollouts(config, task, proven=proven)
 
 
 __all__ = ["Rollouts", "rollouts_of"]

@@ -52,6 +52,11 @@ class Generation(NamedTuple):
 class Rollouts(Protocol):
     """A task's environments, played by teams. Use it in a ``with`` statement, or call `close`."""
 
+    @property
+    def repeated(self) -> int:
+        """Episodes that were begun anew because an environment failed, in this process."""
+        ...
+
     def empty_replay(self) -> Replay:
         """A buffer for what the rollouts bring, with room for all that a run needs."""
         ...
@@ -65,7 +70,7 @@ class Rollouts(Protocol):
             The buffer and the steps made; None if it was interrupted.
 
         Raises:
-            DivergenceError: if the environment gives a reward or a state that is not finite.
+            TaskError: if an environment fails, or hands over what it may not.
         """
         ...
 
@@ -81,8 +86,9 @@ class Rollouts(Protocol):
             replay: the buffer.
 
         Raises:
-            DivergenceError: if a reward, a state or an action is not a finite number.
-            TaskError: if an environment fails.
+            DivergenceError: if an action is not a finite number, or on the device a reward or an
+                observation.
+            TaskError: if an environment fails, or hands over what it may not.
         """
         ...
 

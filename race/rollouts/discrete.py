@@ -22,6 +22,7 @@ from race.rollouts.base import Generation, Score, Steps, check_returns
 from race.rollouts.choosing import Exploration
 from race.rollouts.episodes import Played, empty_episode
 from race.rollouts.host_episodes import HostEnvs
+from race.rollouts.pool import EnvPool
 from race.types import DiscreteTask
 
 TESTS_AT_ONCE = 32
@@ -34,25 +35,41 @@ TESTS_AT_ONCE_ON_HOST = 4
 class EpisodeRollouts:
     """A `race.rollouts.base.Rollouts`: on the device if the task can be played there."""
 
-    def __init__(self, config: Config, task: DiscreteTask, on_device: bool = True) -> None:
+    def __init__(
+        self, config: Config, task: DiscreteTask, on_device: bool = True, proven: bool = False
+    ) -> None:
         """Nothing is made yet.
 
         Args:
             config: the run's configuration.
             task: the task.
             on_device: whether to play on the device if the task can be played there.
+            proven: whether the run has played an episode before.
         """
         self._config, self._spec = config, task.spec
         self._env = task.device() if on_device and task.device is not None else None
-        self._host = HostEnvs(task)
+        pool = EnvPool(
+            task,
+            max(config.n_teams, 2 * TESTS_AT_ONCE_ON_HOST),  # of two teams
+            bool(config.env.processes) or config.env.step_seconds is not None,
+            retries=config.env.retries,
+            step_seconds=config.env.step_seconds,
+            proven=proven,
+        )
+        self._host = HostEnvs(pool)
         self._most = TESTS_AT_ONCE if self._env is not None else TESTS_AT_ONCE_ON_HOST
         self._tests = 0  # at once, so far
+
+    @property
+    def repeated(self) -> int:
+        """Episodes that were begun anew since the environments failed, in this process."""
+        return self._host.pool.repeated
 
     def empty_replay(self) -> Replay:
         """A short run does not pay for a long one's memory: an episode has at least one step."""
         facmac = self._config.facmac
         most = max(self._config.env_steps + self._config.n_teams, facmac.batch_size)
-        item = empty_episode(self._spec, facmac.replay_precision)
+        item = empty_episode(self._spec, str(facmac.replay_precision))
         return init_replay(item, min(facmac.replay_capacity, most))
 
     def warm_up(
@@ -133,7 +150,7 @@ class EpisodeRollouts:
 
     def _play(self, teams: Teams, seeds: NDArray[np.int64], how: Exploration | None) -> Played:
         small = (seeds % 2**31).astype(np.uint32)
-        precision = self._config.facmac.replay_precision
+        precision = str(self._config.facmac.replay_precision)
         if self._env is None:
             return self._host.play(teams, small, how, precision)
         return device.play(self._env, teams, small, how, self._spec, precision)

@@ -1,20 +1,20 @@
 """Episodes of tasks with discrete actions on the host, such as the real StarcraftII."""
 
-from contextlib import AbstractContextManager
-from functools import partial
 from types import TracebackType
-from typing import Any, final
+from typing import final
 
-import gymnasium
 import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
-from race.errors import TaskError, blamed
+from race.envs.contract import Step
+from race.errors import EnvFailedError
+from race.randomness import seed_again
 from race.rollouts.choosing import Exploration, blank, choose
 from race.rollouts.episodes import Played, empty_episode
-from race.types import DiscreteTask, Observation
+from race.rollouts.pool import EnvPool
+from race.types import DiscreteSpec, Observation
 
 _choose = jax.jit(choose)
 _blank = jax.jit(blank)
@@ -22,22 +22,22 @@ _blank = jax.jit(blank)
 
 @final
 class HostEnvs:
-    """Environments of one task on the host, stepped one after the other.
-
-    Use it in a ``with`` statement, or call `close`. They are made when they are needed.
+    """Environments of one task on the host, played by teams. Close the pool after use.
 
     Attributes:
-        task: the task.
+        pool: the environments.
     """
 
-    def __init__(self, task: DiscreteTask) -> None:
-        self.task = task
-        self._envs: list[gymnasium.Env[Any, Any]] = []
+    def __init__(self, pool: EnvPool) -> None:
+        self.pool = pool
 
     def play(
         self, teams: Teams, seeds: NDArray[np.uint32], how: Exploration | None, precision: str
     ) -> Played:
         """One episode per team; see `race.rollouts.device.play`, which does the same.
+
+        An episode whose environment fails is played anew in a fresh one after the others, if the
+        pool allows it, with a seed that depends on its own and the number of the attempt.
 
         Args:
             teams: the teams.
@@ -49,52 +49,54 @@ class HostEnvs:
             As numpy arrays.
 
         Raises:
-            TaskError: if an environment fails, shows something of another shape, or offers an
-                agent no action.
+            HandedOverError: if what an environment hands over breaks the contract.
+            EnvFailedError: if an environment fails.
         """
-        spec, count = self.task.spec, len(seeds)
-        while len(self._envs) < count:
-            with self._blamed(f"making of environment {len(self._envs)}"):
-                self._envs.append(self.task.make(None))
-        episodes = empty_episode(spec, precision, count)
-        returns, won = np.zeros(count, np.float32), np.zeros(count, bool)
-        seen = Observation(
-            np.zeros((count, spec.n_agents, spec.obs_size), np.float32),
-            np.zeros((count, spec.state_size), np.float32),
-            np.zeros((count, spec.n_agents, spec.n_actions), bool),
-        )
-        running = list(range(count))
-        for team in running:
-            self._see(seen, team, partial(self._reset, int(seeds[team])))
-            _write(episodes, seen, team, 0)
+        played = _Playing(self.pool.spec, len(seeds), precision)
+        waiting = {team: int(seed) for team, seed in enumerate(seeds.tolist())}
+        attempt = 0
+        while waiting:
+            failures = self._play(teams, waiting, how, played)
+            attempt += 1
+            self.pool.begin_again(failures, attempt)
+            waiting = {team: seed_again(int(seeds[team]), attempt) for team in failures}
+        self.pool.proven = True
+        return played.result
+
+    def _play(
+        self, teams: Teams, seeds: dict[int, int], how: Exploration | None, played: "_Playing"
+    ) -> dict[int, EnvFailedError]:
+        """An episode of each of some teams; returns those that failed."""
+        failures: dict[int, EnvFailedError] = {}
+        for team, seen in self.pool.reset(seeds).items():
+            if isinstance(seen, Observation):
+                played.see(seen, team, 0)
+            elif isinstance(seen, EnvFailedError):
+                failures[team] = seen
+        running = sorted(set(seeds) - set(failures))
         memory = _blank(teams)
-        for tick in range(spec.episode_limit):
+        for tick in range(self.pool.spec.episode_limit):
             if not running:
                 break
             # A copy, because JAX may still read an array that it was given.
-            shown = jax.tree.map(np.copy, seen)
+            shown = jax.tree.map(np.copy, played.seen)
             memory, chosen = _choose(teams, memory, shown, np.int32(tick), how)
             actions = np.asarray(chosen)
-            for team in tuple(running):
-                reward, terminated, truncated, battle_won = self._see(
-                    seen, team, partial(self._step, actions[team])
-                )
-                episodes.action[team, tick] = actions[team]
-                episodes.reward[team, tick] = reward
-                episodes.terminated[team, tick] = terminated
-                episodes.length[team] = tick + 1
-                _write(episodes, seen, team, tick + 1)
-                returns[team] += np.float32(reward)
-                won[team] |= battle_won
-                if terminated or truncated:
+            steps = self.pool.step({team: actions[team] for team in running})
+            for team, step in steps.items():
+                if isinstance(step, EnvFailedError):
+                    failures[team] = step
+                    played.forget(team)
                     running.remove(team)
-        return Played(episodes, returns, won)
+                    continue
+                played.add(team, tick, actions[team], step)
+                if step.terminated or step.truncated:
+                    running.remove(team)
+        return failures
 
     def close(self) -> None:
         """Closes the environments."""
-        envs, self._envs = self._envs, []
-        for env in envs:
-            env.close()
+        self.pool.close()
 
     def __enter__(self) -> "HostEnvs":
         return self
@@ -107,43 +109,41 @@ class HostEnvs:
     ) -> None:
         self.close()
 
-    @staticmethod
-    def _reset(seed: int, env: gymnasium.Env[Any, Any]) -> tuple[Any, Any]:
-        return env.reset(seed=seed)[0], None
 
-    @staticmethod
-    def _step(action: NDArray[np.int32], env: gymnasium.Env[Any, Any]) -> tuple[Any, Any]:
-        observation, reward, terminated, truncated, info = env.step(action)
-        battle_won = bool(info.get("battle_won", False))
-        return observation, (float(reward), bool(terminated), bool(truncated), battle_won)
+class _Playing:
+    """Episodes as they are played, and what their teams see now."""
 
-    def _see(self, seen: Observation, team: int, move: Any) -> Any:
-        """Makes a move in a team's environment and writes down what it shows."""
-        with self._blamed(f"environment {team}"):
-            observation, outcome = move(self._envs[team])
-            for name, column in seen._asdict().items():
-                value = np.asarray(observation[name])
-                if value.shape != column.shape[1:]:
-                    raise TaskError(
-                        f"The environment of {self.task.spec.task} shows {name} of the shape "
-                        f"{value.shape}; its DiscreteSpec says {column.shape[1:]}."
-                    )
-                column[team] = value
-        idle = np.flatnonzero(~seen.avail_actions[team].any(axis=1))
-        if len(idle):
-            raise TaskError(
-                f"The environment of {self.task.spec.task} offers agent {idle[0]} no action. Give "
-                "every agent one that does nothing, also when it is dead and after the last step."
-            )
-        return outcome
+    def __init__(self, spec: DiscreteSpec, count: int, precision: str) -> None:
+        self.result = Played(
+            empty_episode(spec, precision, count),
+            np.zeros(count, np.float32),
+            np.zeros(count, bool),
+        )
+        self.seen = Observation(
+            np.zeros((count, spec.n_agents, spec.obs_size), np.float32),
+            np.zeros((count, spec.state_size), np.float32),
+            np.zeros((count, spec.n_agents, spec.n_actions), bool),
+        )
 
-    def _blamed(self, what: str) -> AbstractContextManager[None]:
-        # The errors of race.envs.pymarl pass: they name the task and the mistake themselves.
-        return blamed(TaskError, f"The environment of {self.task.spec.task} failed ({what})")
+    def see(self, seen: Observation, team: int, place: int) -> None:
+        """A moment of a team's episode."""
+        with np.errstate(over="ignore"):  # what half precision cannot hold is found and told later
+            for name, value in seen._asdict().items():
+                getattr(self.seen, name)[team] = value
+                getattr(self.result.episodes, name)[team, place] = value
 
+    def add(self, team: int, tick: int, action: NDArray[np.int32], step: Step) -> None:
+        """A step of a team's episode, and the moment after it."""
+        episodes = self.result.episodes
+        episodes.action[team, tick] = action
+        episodes.reward[team, tick] = step.reward
+        episodes.terminated[team, tick] = step.terminated
+        episodes.length[team] = tick + 1
+        self.see(step.seen, team, tick + 1)
+        self.result.episode_return[team] += np.float32(step.reward)
+        self.result.won[team] |= step.won
 
-def _write(episodes: Any, seen: Observation, team: int, place: int) -> None:
-    with np.errstate(over="ignore"):  # what half precision cannot hold is found and told later
-        episodes.obs[team, place] = seen.obs[team]
-        episodes.state[team, place] = seen.state[team]
-    episodes.avail_actions[team, place] = seen.avail_actions[team]
+    def forget(self, team: int) -> None:
+        """A team's failed episode."""
+        for column in jax.tree.leaves(self.result):
+            column[team] = 0

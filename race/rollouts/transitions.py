@@ -1,6 +1,5 @@
 """Rollouts of tasks with continuous actions: transitions from environments on the host."""
 
-import contextlib
 from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, final
@@ -13,12 +12,15 @@ from numpy.typing import NDArray
 from race import programs
 from race.algorithms.base import Teams
 from race.config.settings import Config
-from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds
 from race.replay.buffer import Replay, init_replay
-from race.rollouts.base import Generation, Score, Steps, check_returns
-from race.rollouts.host import EnvPool, collect
-from race.types import EnvSpec, Rollout, Task, Transition
+from race.rollouts.base import Generation, Score, Steps
+from race.rollouts.host import collect
+from race.rollouts.pool import EnvPool
+from race.types import EnvSpec, Task, Transition
+
+TESTS_AT_ONCE = 32
+"""Most environments that tests keep open; more episodes are played in several rounds."""
 
 
 def empty_transition(spec: EnvSpec) -> Transition:
@@ -37,10 +39,22 @@ def empty_transition(spec: EnvSpec) -> Transition:
 class TransitionRollouts:
     """A `race.rollouts.base.Rollouts`. Environments are made when they are needed first."""
 
-    def __init__(self, config: Config, task: Task) -> None:
+    def __init__(self, config: Config, task: Task, proven: bool = False) -> None:
         self._config, self._task = config, task
-        self._pools: dict[int, EnvPool] = {}
-        self._open = contextlib.ExitStack()
+        self._pool = EnvPool(
+            task,
+            max(config.n_teams, TESTS_AT_ONCE),
+            config.env.processes,
+            usual=config.n_teams,
+            retries=config.env.retries,
+            step_seconds=config.env.step_seconds,
+            proven=proven,
+        )
+
+    @property
+    def repeated(self) -> int:
+        """Episodes that were begun anew since the environments failed, in this process."""
+        return self._pool.repeated
 
     def empty_replay(self) -> Replay:
         """A short run does not pay for a long one's memory."""
@@ -74,9 +88,7 @@ class TransitionRollouts:
             ) -> NDArray[np.float32]:
                 return generator.uniform(-1, 1, shape).astype(np.float32)
 
-            pool = self._pool(config.n_teams)
-            rollout = collect(pool, choose, seeds[:-1], max_ticks=missing // playing)
-            _check_finite(rollout, "the random episodes")
+            rollout = collect(self._pool, choose, seeds[:-1], max_ticks=missing // playing)
             replay = store(replay, rollout.transitions)
             collected += len(rollout.transitions.reward)
             index += 1
@@ -96,8 +108,7 @@ class TransitionRollouts:
             actions[-1] += scale * noise.standard_normal(shape, np.float32)
             return actions
 
-        rollout = collect(self._pool(config.n_teams), choose, seeds[:-1])
-        _check_finite(rollout, f"generation {generation + 1}")
+        rollout = collect(self._pool, choose, seeds[:-1])
         replay = store(replay, rollout.transitions)
         return replay, Generation(rollout.episode_return, len(rollout.transitions.reward))
 
@@ -107,25 +118,31 @@ class TransitionRollouts:
         heads: Mapping[str, Float[Array, "N H1 A"]],
         seeds: NDArray[np.int64],
     ) -> dict[str, Score]:
-        """All episodes at once."""
-        n = len(seeds)
-        teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), n, axis=0))
+        """At most `TESTS_AT_ONCE` episodes at once."""
         spec, base = self._task.spec, str(self._config.base)
+        rounds = -(-len(seeds) * len(heads) // TESTS_AT_ONCE)
+        parts: dict[str, list[tuple[NDArray[Any], NDArray[Any]]]] = {name: [] for name in heads}
+        for piece in np.array_split(seeds, rounds):
+            n = len(piece)
+            teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), n, axis=0))
 
-        def choose(states: NDArray[np.float32], _: int) -> NDArray[np.float32]:
-            return np.asarray(programs.act(teams, states, spec=spec, base=base))
+            def choose(
+                states: NDArray[np.float32], _: int, teams: Teams = teams
+            ) -> NDArray[np.float32]:
+                return np.asarray(programs.act(teams, states, spec=spec, base=base))
 
-        rollout = collect(self._pool(n * len(heads)), choose, np.tile(seeds, len(heads)))
-        parts = [slice(i * n, (i + 1) * n) for i in range(len(heads))]
+            rollout = collect(self._pool, choose, np.tile(piece, len(heads)))
+            for i, name in enumerate(heads):
+                part = slice(i * n, (i + 1) * n)
+                parts[name].append((rollout.episode_return[part], rollout.episode_length[part]))
         return {
-            name: Score(rollout.episode_return[part], rollout.episode_length[part])
-            for name, part in zip(heads, parts, strict=True)
+            name: Score(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+            for name, found in parts.items()
         }
 
     def close(self) -> None:
         """Closes the environments and ends their processes."""
-        self._pools.clear()
-        self._open.close()
+        self._pool.close()
 
     def __enter__(self) -> "TransitionRollouts":
         return self
@@ -137,12 +154,6 @@ class TransitionRollouts:
         trace: TracebackType | None,
     ) -> None:
         self.close()
-
-    def _pool(self, size: int) -> EnvPool:
-        if size not in self._pools:
-            pool = EnvPool(self._task, size, self._config.env.processes)
-            self._pools[size] = self._open.enter_context(pool)
-        return self._pools[size]
 
 
 def store(replay: Replay, transitions: Transition) -> Replay:
@@ -156,12 +167,3 @@ def store(replay: Replay, transitions: Transition) -> Replay:
         )
         replay = programs.store(replay, padded, np.int32(count))
     return replay
-
-
-def _check_finite(rollout: Rollout, where: str) -> None:
-    if not np.isfinite(rollout.transitions.next_state).all():
-        raise DivergenceError(
-            f"The environment gave a state that is not a finite number in {where}. A buffer that "
-            "holds it teaches nothing, so the run stops here. Look at the task's observation."
-        )
-    check_returns(rollout.episode_return, where)

@@ -18,6 +18,7 @@ from race.config import settings as configs
 from race.config.presets import resolve
 from race.errors import ConfigError, RunDirectoryError
 from race.runs.recorded import Recorded
+from race.runs.sealed import parse
 
 SUFFIX = ".jsonl.gz"
 FORMAT = {"format": "race-archive", "version": 1}
@@ -25,7 +26,7 @@ DIGITS = 6
 """Significant digits of numbers that are not whole; a test return's noise is in its third."""
 
 # Of a generation's row: what is the newest value, not a mean over generations.
-_LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/")
+_LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/", "env/")
 _DAMAGES = (ValueError, KeyError, TypeError, EOFError, IndexError, StopIteration, zlib.error)
 # Of a run's origin: the versions that may change numbers.
 _ORIGIN = (
@@ -74,9 +75,9 @@ def read(path: Path) -> list[Recorded]:
     try:
         with gzip.open(path, "rt", encoding="utf-8") as file:
             head, *lines = file.read().splitlines()
-        if json.loads(head) != FORMAT:
+        if parse(head) != FORMAT:
             raise ValueError(f"its first line is {head[:80]}")
-        return [_unpacked(path, json.loads(line)) for line in lines]
+        return [_unpacked(path, parse(line)) for line in lines]
     except OSError as error:
         raise RunDirectoryError(f"The archive {path} cannot be read: {error}.") from error
     except (*_DAMAGES, ConfigError) as error:

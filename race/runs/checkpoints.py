@@ -29,7 +29,9 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load_file, save_file
 
-from race.errors import CheckpointError
+from race.errors import CheckpointError, command
+from race.runs.metrics import Extent
+from race.runs.sealed import parse_object
 
 FORMAT = "race-checkpoint"
 VERSION = 1
@@ -91,6 +93,18 @@ def newest(directory: Path) -> Path | None:
     """The checkpoint with the largest number, or None if there is none."""
     found = list_checkpoints(directory)
     return found[-1] if found else None
+
+
+def metrics_extent(directory: Path) -> Extent | None:
+    """What the newest checkpoint says of the metrics; None where nothing can be known."""
+    found = newest(directory)
+    if found is None:
+        return None
+    try:
+        told = _read_manifest(found)["info"]["metrics"]
+        return Extent(int(told["offset"]), str(told["digest"]))
+    except (_DamagedError, OSError, KeyError, TypeError, ValueError):
+        return None
 
 
 def save(
@@ -166,7 +180,8 @@ def save(
             f"The checkpoint {directory / name} could not be written: {error}. It needs "
             f"{_megabytes(needed)} of disk space and {_megabytes(_free(directory))} are free. The "
             "checkpoints before it are untouched: free some space, see that the folder is "
-            f"writable, and run `race resume {directory.parent}` to go on from the newest."
+            f"writable, and run `{command('race', 'resume', directory.parent)}` to go on from "
+            "the newest."
         ) from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -312,10 +327,10 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise _DamagedError(f"it has no {_MANIFEST}, so it is no checkpoint of race")
     try:
         text = (path / _MANIFEST).read_bytes().decode()
-        body = json.loads(text)
+        body = parse_object(text)
     except ValueError as error:
         raise _DamagedError(f"its {_MANIFEST} is damaged") from error
-    if not isinstance(body, dict) or body.get("format") != FORMAT:
+    if body.get("format") != FORMAT:
         raise _DamagedError(f"its {_MANIFEST} is damaged or was written by another program")
     if body.get("version") != VERSION:
         raise _DamagedError(
@@ -338,9 +353,10 @@ def _advice(path: Path) -> str:
     for candidate in reversed(older):
         with contextlib.suppress(_DamagedError, OSError):
             _verify(candidate)
+            go_on = command("race", "resume", path.parent.parent)
             return (
                 f"The next older checkpoint, {candidate}, is intact: remove the folder {path} and "
-                f"run `race resume {path.parent.parent}` again to go on from there."
+                f"run `{go_on}` again to go on from there."
             )
     return (
         "There is no older intact checkpoint beside it: unless you can put it right, start the "

@@ -1,10 +1,9 @@
 """The directory of a run: what lies where, and who may write to it."""
 
-import contextlib
-import fcntl
 import json
 import os
-from collections.abc import Iterator, Mapping
+import secrets
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,25 @@ from typing import Any
 from race.config import settings as configs
 from race.config.presets import resolve
 from race.config.settings import Config
-from race.errors import ConfigError, RunDirectoryError
+from race.errors import ConfigError, RunDirectoryError, command
+from race.runs.lock import lock
 from race.runs.metadata import metadata
+from race.runs.sealed import BrokenSealError, parse_object, seal, unseal
+
+__all__ = [
+    "RunDirectory",
+    "change_config",
+    "clear_finished",
+    "create",
+    "identity_of",
+    "is_finished",
+    "lock",
+    "mark_finished",
+    "open_run",
+    "read_metadata",
+    "recorded_task",
+    "refuse_occupied",
+]
 
 
 @dataclass(frozen=True)
@@ -47,11 +63,6 @@ class RunDirectory:
         """Exists once the run has used its whole budget."""
         return self.path / "DONE"
 
-    @property
-    def lock(self) -> Path:
-        """Locked while a process writes to the run; holds that process's id."""
-        return self.path / ".lock"
-
 
 def create(
     path: Path, config: Config, environment: Mapping[str, Any] | None = None
@@ -67,30 +78,52 @@ def create(
         RunDirectoryError: if ``path`` already holds a run, is a file, or cannot be written.
     """
     run = RunDirectory(path)
-    occupied = RunDirectoryError(
-        f"{path} already holds a run. Continue it with `race resume {path}`, or choose another "
-        "directory with `--run-dir`."
-    )
     try:
-        if any(part.exists() for part in (run.config, run.metrics, run.checkpoints)):
-            raise occupied
-        path.mkdir(parents=True, exist_ok=True)
+        refuse_occupied(path)
         text = _json(metadata(environment or {}))
+        path.mkdir(parents=True, exist_ok=True)
         # Whoever gets config.json there first owns the directory; only then is the rest written.
-        _write(run.config, _json(configs.to_json(config)), exclusive=True)
+        identity = secrets.token_hex(8)
+        _write(run.config, _config_text(config, identity), exclusive=True)
         _write(run.metadata, text)
     except FileExistsError as error:
         if path.is_dir():
-            raise occupied from error
+            raise _occupied(path) from error
         raise RunDirectoryError(
             f"{path} is a file, not a directory. Choose another directory with `--run-dir`."
         ) from error
     except OSError as error:
-        raise RunDirectoryError(
-            f"The run directory {path} cannot be written: {error}. Choose another directory with "
-            "`--run-dir`, or see that this one is writable and the disk is not full."
-        ) from error
+        raise _not_writable(path, error) from error
     return run
+
+
+def refuse_occupied(path: Path) -> None:
+    """Refuses a directory that holds a run, before time is spent on a new one.
+
+    Raises:
+        RunDirectoryError: if there is a run.
+    """
+    run = RunDirectory(path)
+    try:
+        occupied = any(part.exists() for part in (run.config, run.metrics, run.checkpoints))
+    except OSError as error:  # such as a name that is too long
+        raise _not_writable(path, error) from error
+    if occupied:
+        raise _occupied(path)
+
+
+def _occupied(path: Path) -> RunDirectoryError:
+    return RunDirectoryError(
+        f"{path} already holds a run. Continue it with `{command('race', 'resume', path)}`, or "
+        "choose another directory with `--run-dir`."
+    )
+
+
+def _not_writable(path: Path, error: OSError) -> RunDirectoryError:
+    return RunDirectoryError(
+        f"The run directory {path} cannot be written: {error}. Choose another directory with "
+        "`--run-dir`, or see that this one is writable and the disk is not full."
+    )
 
 
 def change_config(path: Path, config: Config) -> None:
@@ -99,9 +132,9 @@ def change_config(path: Path, config: Config) -> None:
     Raises:
         RunDirectoryError: if it cannot be written.
     """
-    file = RunDirectory(path).config
+    file, identity = RunDirectory(path).config, identity_of(path)
     try:
-        _write(file, _json(configs.to_json(config)))
+        _write(file, _config_text(config, identity))
     except OSError as error:
         raise _unwritable(file, error) from error
 
@@ -112,12 +145,40 @@ def open_run(path: Path) -> Config:
     Raises:
         RunDirectoryError: if the directory holds no run, or its config.json cannot be read.
     """
+    return _read_config(path)[0]
+
+
+def identity_of(path: Path) -> str | None:
+    """What tells the run in ``path`` from all others: its checkpoints and metrics name it too.
+
+    Runs of older versions have none.
+
+    Raises:
+        RunDirectoryError: as `open_run`.
+    """
+    return _read_config(path)[1]
+
+
+def _config_text(config: Config, identity: str | None) -> str:
+    # A run of before there were identities stays as it is.
+    body = configs.to_json(config)
+    return _json(body if identity is None else seal(body | {"run": identity}))
+
+
+def _read_config(path: Path) -> tuple[Config, str | None]:
     file = RunDirectory(path).config
     try:
-        data = json.loads(file.read_text(encoding="utf-8"))
-        if not isinstance(data, dict):
-            raise ValueError("no object")
-        return resolve(configs.from_json(data))
+        data, sealed = unseal(parse_object(file.read_bytes().decode()))
+        identity = data.pop("run", None)
+        if sealed != isinstance(identity, str):
+            raise BrokenSealError("it has lost its digest or its identity")
+        return resolve(configs.from_json(data)), identity
+    except BrokenSealError as error:
+        raise RunDirectoryError(
+            f"{file} was changed since race wrote it: {error}. A run that goes on with other "
+            "settings is none that could be repeated. Put it back from a copy, or begin a new run "
+            "with the settings you want; only --env-steps of `race resume` extends one."
+        ) from error
     except (FileNotFoundError, NotADirectoryError) as error:
         raise RunDirectoryError(
             f"{path} is not the directory of a run: it has no config.json. Give the directory that "
@@ -142,10 +203,15 @@ def open_run(path: Path) -> Config:
 def read_metadata(path: Path) -> dict[str, Any]:
     """What was recorded of the run's origin; nothing where that is missing or damaged."""
     try:
-        data = json.loads(RunDirectory(path).metadata.read_text(encoding="utf-8"))
+        return parse_object(RunDirectory(path).metadata.read_bytes())
     except (OSError, ValueError):
         return {}
-    return data if isinstance(data, dict) else {}
+
+
+def recorded_task(path: Path) -> dict[str, Any]:
+    """What was recorded of the run's task; nothing where that is missing or damaged."""
+    told = read_metadata(path).get("environment")
+    return told if isinstance(told, dict) else {}
 
 
 def mark_finished(path: Path) -> None:
@@ -182,59 +248,6 @@ def _unwritable(file: Path, error: OSError) -> RunDirectoryError:
     return RunDirectoryError(
         f"{file} cannot be written: {error}. See that it is writable and the disk is not full."
     )
-
-
-@contextlib.contextmanager
-def lock(path: Path) -> Iterator[None]:
-    """Holds the right to write to a run, so that two processes never do at once.
-
-    The right ends with the block or with the process, however it ends.
-
-    Raises:
-        RunDirectoryError: if another holds it (names its process), or ``path`` is no directory
-            that can be written.
-    """
-    try:
-        descriptor = os.open(RunDirectory(path).lock, os.O_RDWR | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise RunDirectoryError(
-            f"The run directory {path} cannot be locked: {error}. See that it exists and is "
-            "writable."
-        ) from error
-    _held.add(descriptor)
-    try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            holder = os.pread(descriptor, 32, 0).decode(errors="replace").strip() or "unknown"
-            raise RunDirectoryError(
-                f"The run in {path} is being written by another process (id {holder}). Wait until "
-                "it ends, or end it, and try again; a new run needs another `--run-dir`."
-            ) from error
-        except OSError as error:
-            raise RunDirectoryError(
-                f"The run directory {path} cannot be locked: {error}. Choose a directory on a file "
-                "system that has locks."
-            ) from error
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"{os.getpid()}\n".encode(), 0)
-        yield
-    finally:
-        _held.discard(descriptor)
-        os.close(descriptor)
-
-
-# A forked child shares the lock: environment processes that outlive a killed run would keep it.
-_held: set[int] = set()
-
-
-def _release_in_child() -> None:
-    for descriptor in _held:
-        os.close(descriptor)
-    _held.clear()
-
-
-os.register_at_fork(after_in_child=_release_in_child)
 
 
 def _json(value: Any) -> str:

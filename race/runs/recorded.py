@@ -36,7 +36,8 @@ def settings(config: Config) -> dict[str, Any]:
     kept = dataclasses.asdict(config)
     for name in ("seed", "env_steps", "checkpoint"):
         del kept[name]
-    del kept["env"]["processes"]
+    for name in ("processes", "retries", "step_seconds"):
+        del kept["env"][name]
     if not config.has_population:
         del kept["race"]
     if config.discrete:

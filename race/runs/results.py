@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from race.errors import RunDirectoryError
-from race.runs import archive, metrics
+from race.runs import archive, checkpoints, metrics
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.runs.recorded import Recorded
@@ -36,8 +36,10 @@ def of_directory(path: Path) -> Recorded:
         RunDirectoryError: if it cannot be read.
     """
     run = RunDirectory(path)
-    config = run_directory.open_run(path)
-    rows = metrics.read(run.metrics) if run.metrics.exists() else []
+    config, identity = run_directory.open_run(path), run_directory.identity_of(path)
+    # Before the rows, which are the newer then and hold all that it knows of.
+    kept = checkpoints.metrics_extent(run.checkpoints)
+    rows = metrics.read(run.metrics, identity, kept) if run.metrics.exists() else []
     return Recorded(str(path), config, rows, run_directory.read_metadata(path))
 
 

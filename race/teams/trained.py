@@ -1,6 +1,7 @@
 """Trained teams, read back from a run directory, ready to act."""
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, final
 
@@ -12,15 +13,16 @@ from numpy.typing import ArrayLike, NDArray
 from race.algorithms import algorithm_of
 from race.algorithms.base import Teams, tested_teams
 from race.config.settings import Config, TeamName
-from race.envs import make_task
-from race.errors import ConfigError, RunDirectoryError, TaskError
+from race.envs import contract, make_task
+from race.envs.description import refuse_changed
+from race.errors import ConfigError, HandedOverError, RunDirectoryError, command
 from race.programs import act
 from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.training.run_state import Progress
-from race.training.saving import learned_of, progress_of
+from race.training.saving import check_owner, learned_of, progress_of
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
 
 _choose = jax.jit(choose)
@@ -49,8 +51,11 @@ class Trained(NamedTuple):
             )
         return name
 
-    def policy(self, team: TeamName) -> Callable[[NDArray[np.float32]], NDArray[np.float32]]:
+    def policy(self, team: TeamName) -> Callable[[ArrayLike], NDArray[np.float32]]:
         """The team as a function from a state [S] to a joint action [U] in [-1, 1].
+
+        The function raises `HandedOverError` for what an environment of the task may not show:
+        another shape, or an entry that is not finite.
 
         Raises:
             ConfigError: if the run has no such team, or its task has discrete actions.
@@ -63,8 +68,10 @@ class Trained(NamedTuple):
         teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
         spec, base = self.task.spec, str(self.config.base)
 
-        def joint_action(state: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.asarray(act(teams, state[None], spec=spec, base=base))[0]
+        def joint_action(state: ArrayLike) -> NDArray[np.float32]:
+            with _told(spec.task):
+                seen = contract.state(spec, state)
+            return np.asarray(act(teams, seen[None], spec=spec, base=base))[0]
 
         return joint_action
 
@@ -103,21 +110,27 @@ class RecurrentPolicy:
             avail_actions: which actions each can take, [N, A], at least one.
 
         Raises:
-            TaskError: if an array has another shape.
+            HandedOverError: for what an environment of the task may not show: another shape, an
+                entry that is not finite, a mask of something else than 0 and 1, no action.
         """
-        spec = self._spec
-        arrays = np.array(obs, np.float32), np.array(avail_actions, bool)
-        sizes = (spec.n_agents, spec.obs_size), (spec.n_agents, spec.n_actions)
-        for name, array, size in zip(("obs", "avail_actions"), arrays, sizes, strict=True):
-            if array.shape != size:
-                raise TaskError(
-                    f"{name} of {spec.task} has the shape {size}; it was given {array.shape}."
-                )
         # Teams choose by what agents observe; the state is for the learner alone.
-        state = np.zeros((1, spec.state_size), np.float32)
-        seen = Observation(arrays[0][None], state, arrays[1][None])
+        state = np.zeros(self._spec.state_size, np.float32)
+        shown = {"obs": obs, "state": state, "avail_actions": avail_actions}
+        with _told(self._spec.task):
+            moment = contract.moment(self._spec, shown)
+        seen = Observation(*(column[None] for column in moment))
         self._memory, action = _choose(self._teams, self._memory, seen, np.int32(0), None)
         return np.asarray(action)[0]
+
+
+@contextlib.contextmanager
+def _told(task: str) -> Iterator[None]:
+    try:
+        yield
+    except HandedOverError as error:
+        raise HandedOverError(
+            f"The team was shown what no environment of {task} may show: {error}."
+        ) from error
 
 
 def load_trained(path: Path) -> Trained:
@@ -132,10 +145,12 @@ def load_trained(path: Path) -> Trained:
     if newest is None:
         raise RunDirectoryError(
             f"The run in {path} has no checkpoint yet. Wait for its first one, or go on with it: "
-            f"race resume {path}"
+            + command("race", "resume", path)
         )
     saved = checkpoints.load(newest, tables=False)
+    check_owner(saved, run_directory.identity_of(path))
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
+    refuse_changed(run_directory.recorded_task(path), task)
     state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
     encoder, heads = tested_teams(algorithm, state, task.spec, config.has_population)
     return Trained(config, task, progress_of(saved), encoder, heads)

@@ -18,7 +18,7 @@ from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Layout
 from race.replay.packing import layouts
 from race.training.records import evaluation_row, generation_row
-from race.training.run import Run, stamped
+from race.training.run import Run, counted, stamped
 from race.training.run_state import RunState
 
 CHUNK = 100
@@ -33,7 +33,7 @@ def warm_up(run: Run, state: RunState) -> RunState:
     If it is interrupted, the state stays as it was.
 
     Raises:
-        DivergenceError: if the environment gives a reward or a state that is not finite.
+        TaskError: if an environment fails, or hands over what it may not.
     """
 
     def report(steps: int) -> None:
@@ -43,7 +43,7 @@ def warm_up(run: Run, state: RunState) -> RunState:
     if warm is None:
         return state
     replay, steps = warm
-    progress = state.progress.but(env_steps=steps, random_steps=steps)
+    progress = counted(run, state.progress.but(env_steps=steps, random_steps=steps))
     return state._replace(replay=replay, progress=progress)
 
 
@@ -88,6 +88,7 @@ def roll_out(run: Run, state: RunState) -> RunState:
 
     Raises:
         DivergenceError: if a fitness or an action is not a finite number.
+        TaskError: if an environment fails, or hands over what it may not.
     """
     progress = state.progress
     run.report("rollouts", progress, {})
@@ -104,7 +105,7 @@ def roll_out(run: Run, state: RunState) -> RunState:
         marl_return=returns[-1],
         learning=True,
     )
-    return state._replace(replay=replay, progress=progress)
+    return state._replace(replay=replay, progress=counted(run, progress))
 
 
 def evolve(run: Run, state: RunState) -> RunState:
@@ -193,7 +194,7 @@ def test(run: Run, state: RunState) -> RunState:
     encoder, tested = tested_teams(run.algorithm, state.algorithm, spec, config.has_population)
     seeds = host_seeds(config.seed, Purpose.EVALUATION, progress.generation, episodes)
     scores = run.rollouts.test(encoder, tested, seeds)
-    progress = stamped(run, progress.but(evaluated_at=progress.env_steps))
+    progress = counted(run, stamped(run, progress.but(evaluated_at=progress.env_steps)))
     row = evaluation_row(progress, scores)
     run.metrics.write(row)
     run.report("evaluation", progress, row)

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as a request: what is under way is finished and saved first."""
+"""Ctrl-C, SIGTERM and SIGHUP as a request: what is under way is finished and saved first."""
 
 import signal
 import threading
@@ -8,10 +8,10 @@ from typing import Any, final
 
 @final
 class Interrupts:
-    """Turns the first SIGINT or SIGTERM within a ``with`` block into `requested`.
+    """Turns the first SIGINT, SIGTERM or SIGHUP within a ``with`` block into `requested`.
 
-    A second one interrupts at once, as if there were no handler. Outside the main thread, where
-    Python delivers no signals, it does nothing.
+    A second one interrupts at once, as if there were no handler. What is ignored, as SIGHUP under
+    ``nohup``, stays so. Outside the main thread, where Python delivers no signals, it does nothing.
     """
 
     def __init__(self) -> None:
@@ -20,7 +20,9 @@ class Interrupts:
 
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) == signal.SIG_IGN:
+                    continue
                 self._previous[number] = signal.signal(number, self._request)
         return self
 

@@ -61,6 +61,14 @@ def evaluation_row(progress: Progress, scores: Mapping[str, Score]) -> dict[str,
     return row
 
 
+def lost_row(progress: Progress) -> dict[str, Any]:
+    """The first row of new metrics, where those before were lost."""
+    said = "The rows before this one were lost; the run went on without them."
+    return {"kind": "note", **_counters(progress), "note": said}
+
+
 def _counters(progress: Progress) -> dict[str, Any]:
     names = ("generation", "env_steps", "gradient_steps", "wall_seconds")
-    return {name: getattr(progress, name) for name in names}
+    counters = {name: getattr(progress, name) for name in names}
+    repeated = {"env/repeated_episodes": progress.repeated} if progress.repeated else {}
+    return counters | repeated

@@ -47,6 +47,8 @@ class Progress:
     """Wall time of the current generation so far."""
     rollout_seconds: float = 0.0
     """Part of it that went into rollouts and their bookkeeping."""
+    repeated: int = 0
+    """Episodes that were begun anew because an environment failed."""
     metrics_offset: int = 0
     """Bytes of ``metrics.jsonl`` when the checkpoint was written."""
 

@@ -18,6 +18,7 @@ from race.randomness import Purpose, root_key
 from race.replay.buffer import Replay
 from race.runs import checkpoints
 from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
+from race.runs.metrics import Extent
 from race.runs.trees import flatten, restore
 from race.training.run import Run, stamped
 from race.training.run_state import Progress, RunState, statics
@@ -45,21 +46,26 @@ def save(run: Run, state: RunState) -> None:
     checkpoints.save(
         run.directory.checkpoints,
         f"step-{progress.env_steps:012d}",
-        *_contents(state, progress),
+        *_contents(run, state, progress),
         run.config.checkpoint.keep,
         _segment_rows(state.replay),
     )
 
 
 def _contents(
-    state: RunState, progress: Progress
+    run: Run, state: RunState, progress: Progress
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Rows]]:
     """What `race.runs.checkpoints.save` takes: arrays, info, rows."""
     replay = state.replay
     columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
     rows = Rows(columns, int(replay.inserted), replay.capacity)
     arrays = flatten({"algorithm": state.algorithm, "losses": state.losses})
-    info = {"progress": dataclasses.asdict(progress), "algorithm_version": ALGORITHM_VERSION}
+    info = {
+        "progress": dataclasses.asdict(progress),
+        "algorithm_version": ALGORITHM_VERSION,
+        "run": run.identity,
+        "metrics": run.metrics.extent._asdict(),
+    }
     return arrays, info, {"replay": rows}
 
 
@@ -82,6 +88,29 @@ def check_version(began_with: Any) -> None:
             "with the version named in metadata.json, or begin a new run; evaluate, render and "
             "plot read this one as it is."
         )
+
+
+def check_owner(saved: Checkpoint, identity: str | None) -> None:
+    """Refuses a checkpoint of another run; those of old runs name none.
+
+    Raises:
+        CheckpointError: naming both.
+    """
+    owner = saved.info.get("run")
+    if owner != identity:
+        raise CheckpointError(
+            f"The checkpoint {saved.path} belongs to another run ({owner or 'without a name'}) "
+            f"than the config.json of its directory ({identity or 'without a name'}), whose "
+            "settings say nothing of it. Put each back where it was."
+        )
+
+
+def metrics_kept(saved: Checkpoint | None) -> Extent:
+    """The rows that a checkpoint knows of."""
+    if saved is None:
+        return Extent(0)
+    told = saved.info.get("metrics", {})
+    return Extent(progress_of(saved).metrics_offset, told.get("digest"))
 
 
 def from_checkpoint(
@@ -125,7 +154,8 @@ def progress_of(saved: Checkpoint) -> Progress:
     """
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
-    if not isinstance(values, dict) or set(values) != names:
+    # Runs of before it was counted lack the last.
+    if not isinstance(values, dict) or set(values) | {"repeated"} != names:
         raise CheckpointError(
             f"The checkpoint {saved.path} was not written by this version of race: its record of "
             "the run's progress differs. Use the version named in metadata.json."

@@ -11,13 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, final, get_args
 
-import gymnasium
 import imageio
 import numpy as np
 from numpy.typing import NDArray
 
-from race.errors import RenderError
-from race.rollouts.host import in_units
+from race.envs.checked import CheckedEnv
+from race.envs.contract import in_units
+from race.errors import RenderError, TaskError
 from race.types import Task
 
 Backend = Literal["egl", "osmesa", "glfw", "sketch"]
@@ -123,7 +123,7 @@ class Episode:
         """
         self._task, self._policy, self._seed = task, policy, seed
         self._env, self._paint = _painter(task, renderer)
-        step_seconds = _step_seconds(self._env)
+        step_seconds = _step_seconds(self._env.env)
         self._stride = math.ceil(1 / step_seconds / _MOST_FRAMES_PER_SECOND - 1e-6)
         self.fps = 1 / step_seconds / self._stride
         limit = task.spec.episode_limit
@@ -137,17 +137,17 @@ class Episode:
         low = np.array(self._task.spec.action_low, np.float32)
         high = np.array(self._task.spec.action_high, np.float32)
         with contextlib.closing(self._env):
-            state, _ = self._env.reset(seed=self._seed)
+            state: Any = self._env.reset(self._seed)
             yield self._paint(self._caption())
-            for step in range(self._steps):
-                action = self._policy(np.asarray(state, np.float32))
-                units = in_units(np.clip(action, -1, 1), low, high)
-                state, reward, terminated, truncated, _ = self._env.step(units)
-                self.episode_return += float(reward)
-                self.steps = step + 1
+            for _ in range(self._steps):
+                action = np.clip(self._policy(state), -1, 1)
+                made = self._env.step(in_units(action, low, high))
+                state = made.seen
+                self.episode_return += made.reward
+                self.steps += 1
                 if self.steps % self._stride == 0:
                     yield self._paint(self._caption())
-                if terminated or truncated:
+                if made.terminated or made.truncated:
                     return
 
     def _caption(self) -> str:
@@ -156,34 +156,30 @@ class Episode:
 
 def _painter(
     task: Task, renderer: Renderer
-) -> tuple[gymnasium.Env[Any, Any], Callable[[str], NDArray[np.uint8]]]:
+) -> tuple[CheckedEnv, Callable[[str], NDArray[np.uint8]]]:
     import mujoco
 
     from race.viewing import sketch
 
-    env = task.make(None)
-    model, data = (getattr(env.unwrapped, name, None) for name in ("model", "data"))
+    env = CheckedEnv(task)
+    inner = getattr(env.env, "unwrapped", env.env)
+    model, data = (getattr(inner, name, None) for name in ("model", "data"))
     if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
         if renderer.backend != "sketch":
             with contextlib.suppress(Exception):  # mujoco took up another backend, or none
                 scene = _opengl(model, data)
                 return env, lambda caption: sketch.with_caption(scene(), caption)
         return env, lambda caption: sketch.draw(model, data, SIZE, caption)
-    env.close()
-    if "rgb_array" not in env.metadata.get("render_modes", ()):
+    offered = getattr(env.env, "metadata", None) or {}
+    with contextlib.suppress(TaskError):  # it is not needed any more
+        env.close()
+    if "rgb_array" not in offered.get("render_modes", ()):
         raise RenderError(
             f"The environment of {task.spec.task} cannot be drawn: it is not MuJoCo's and offers "
             "no render_mode 'rgb_array'. Add that mode to the environment to make videos of it."
         )
-    drawn = task.make("rgb_array")
-
-    def paint(caption: str) -> NDArray[np.uint8]:
-        frame = drawn.render()
-        if not isinstance(frame, np.ndarray) or frame.ndim != 3:
-            raise RenderError(f"The environment of {task.spec.task} drew no image.")
-        return sketch.with_caption(np.ascontiguousarray(frame[..., :3]), caption)
-
-    return drawn, paint
+    drawn = CheckedEnv(task, render_mode="rgb_array")
+    return drawn, lambda caption: sketch.with_caption(drawn.render(), caption)
 
 
 def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
@@ -212,11 +208,26 @@ def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
     return scene
 
 
-def _step_seconds(env: gymnasium.Env[Any, Any]) -> float:
-    seconds = getattr(env.unwrapped, "dt", None)
-    if isinstance(seconds, float) and seconds > 0:
+def _step_seconds(env: Any) -> float:
+    seconds = getattr(getattr(env, "unwrapped", env), "dt", None)
+    if isinstance(seconds, float) and 0 < seconds < np.inf:
         return seconds
-    return 1 / float(env.metadata.get("render_fps") or _MOST_FRAMES_PER_SECOND)
+    return 1 / frames_per_second(env, _MOST_FRAMES_PER_SECOND)
+
+
+def frames_per_second(env: Any, otherwise: float) -> float:
+    """What an environment says of the speed at which its pictures are to be shown.
+
+    Raises:
+        RenderError: if that is no speed.
+    """
+    said = (getattr(env, "metadata", None) or {}).get("render_fps") or otherwise
+    if not isinstance(said, int | float) or not 0 < said < 1e6:
+        raise RenderError(
+            f"The environment's metadata say render_fps {said!r}. Let it be how many steps are "
+            "shown in a second."
+        )
+    return float(said)
 
 
 def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:

@@ -12,7 +12,7 @@ from typing import Any
 
 import imageio_ffmpeg
 import pytest
-from commands import fails, race
+from commands import alone, fails, race
 from PIL import Image
 
 from race.cli import COMMANDS
@@ -75,7 +75,8 @@ def test_a_run_directory_holds_what_it_should(trained: Path) -> None:
 
 
 def test_presets_are_defaults_and_flags_win(tmp_path: Path) -> None:
-    race(f"train probe/terminates --preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {SMALL}")
+    options = f"--preset td3 --algo maddpg --run-dir {tmp_path / 'a'} {alone(SMALL)}"
+    race(f"train probe/terminates {options}")
     learner = json.loads((tmp_path / "a" / "config.json").read_text())["learner"]
     assert learner["actor_learning_rate"] == 3e-4  # from the preset
     assert learner["batch_size"] == 8  # from the flags
@@ -173,7 +174,7 @@ def test_ctrl_c_saves_and_says_how_to_go_on(
     race(f"resume {path}")
 
     def rows(of: Path) -> list[dict[str, Any]]:
-        timeless = re.compile("wall_seconds|time/.*")
+        timeless = re.compile("wall_seconds|time/.*|run$")
         found = metrics.read(of / "metrics.jsonl")
         return [{k: v for k, v in row.items() if not timeless.match(k)} for row in found]
 
@@ -315,7 +316,7 @@ def test_bad_input_to_a_run(run: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_a_champion_needs_a_population(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {SMALL}")
+    race(f"train probe/terminates --algo matd3 --run-dir {tmp_path / 'run'} {alone(SMALL)}")
     capsys.readouterr()
     assert "no population" in fails(f"evaluate {tmp_path / 'run'} --team champion", capsys)
 
@@ -353,6 +354,59 @@ def test_a_checkpoint_of_another_run_is_refused(
     capsys.readouterr()
     assert "checkpoint" in fails(f"resume {run} --env-steps 500", capsys)
     assert "checkpoint" in fails(f"evaluate {run}", capsys)
+
+
+def test_a_run_of_another_seed_is_another_run(
+    trained: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    race(f"train probe/terminates --seed 2 --run-dir {tmp_path / 'other'} {SMALL}")
+    capsys.readouterr()
+    for part in ("checkpoints", "config.json", "metrics.jsonl"):
+        mixed = Path(shutil.copytree(trained, tmp_path / f"mixed-{part}"))
+        other = tmp_path / "other" / part
+        if other.is_dir():
+            shutil.rmtree(mixed / part)
+            shutil.copytree(other, mixed / part)
+        else:
+            shutil.copy(other, mixed / part)
+        commands = {"resume --env-steps 500": "another run"}
+        if part != "metrics.jsonl":
+            commands |= {"evaluate": "belongs to another run", "render": "another run"}
+        if part != "checkpoints":
+            commands |= {"plot": "another run"}
+        for command, told in commands.items():
+            name, *options = command.split()
+            message = fails(" ".join([name, str(mixed), *options]), capsys)
+            assert told in message, (part, command, message)
+
+
+def test_lost_metrics_are_no_end(
+    trained: Path, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "has no effect" in fails(f"resume {run} --env-steps 500 --without-metrics", capsys)
+    text = (run / "metrics.jsonl").read_text()
+    (run / "metrics.jsonl").write_text(text.replace('"generation": 1', '"generation": 7', 1))
+    for command in (f"resume {run} --env-steps 150", f"plot {run} --out {tmp_path / 'a.png'}"):
+        message = fails(command, capsys)
+        assert "are not those that were there" in message
+        assert f"race resume {run} --without-metrics" in message
+    race(f"resume {run} --env-steps 150 --without-metrics")
+    whole = Path(shutil.copytree(trained, tmp_path / "whole"))
+    race(f"resume {whole} --env-steps 150")
+    old = [json.loads(line) for line in text.splitlines()]
+    first, *rows = metrics.read(run / "metrics.jsonl")
+    assert (first["kind"], first["run"]) == ("note", old[0]["run"])
+    assert "were lost" in first["note"]
+    assert first["env_steps"] == old[-1]["env_steps"]
+    timeless = re.compile("wall_seconds|time/.*")
+    expected = metrics.read(whole / "metrics.jsonl")[len(old) :]
+    for row, other in zip(rows, expected, strict=True):
+        assert all(row[k] == other[k] for k in other if not timeless.match(k))
+    assert (run / "metrics-lost-1.jsonl").read_text() != text
+    race(f"plot {run} --out {tmp_path / 'a.png'}")
+    (run / "metrics.jsonl").unlink()
+    race(f"resume {run} --env-steps 180 --without-metrics")
+    assert metrics.read(run / "metrics.jsonl")[0]["kind"] == "note"
 
 
 def test_a_config_of_another_program_is_refused(

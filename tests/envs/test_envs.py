@@ -18,7 +18,8 @@ from race.envs import (
 )
 from race.envs.micro import load_map, map_names
 from race.errors import TaskError
-from race.rollouts.host import EnvPool, collect
+from race.rollouts.host import collect
+from race.rollouts.pool import EnvPool
 from race.types import DiscreteTask, Task
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "environments.md"

@@ -181,3 +181,70 @@ def test_nothing_is_printed(capfd, tmp_path, monkeypatch):
     make_task("mamujoco/HalfCheetah-2x3").make(None).reset(seed=0)
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []  # mujoco writes its log into the current directory
+
+
+def observed(task, env):
+    """What each agent sees of the robot as it stands."""
+    augmented = getattr(env, "observation", lambda state: state)
+    state = augmented(env.unwrapped._get_obs())
+    return [state[list(index)] for index in task.spec.obs_index]
+
+
+def seeing(task):
+    """By moving it, which agents see each actuator's joint; and each joint of the root."""
+    env = task.make(None)
+    env.reset(seed=0)
+    robot, model = env.unwrapped, env.unwrapped.model
+    position, velocity = robot.data.qpos.copy(), np.linspace(-0.5, 0.5, model.nv)
+    robot.set_state(position, velocity)
+    before = observed(task, env)
+
+    def seen_at(address, speed):
+        found = []
+        for moved_position, moved_velocity in ((address, None), (None, speed)):
+            there, fast = position.copy(), velocity.copy()
+            if moved_position is not None:
+                there[moved_position] += 0.05
+            else:
+                fast[moved_velocity] += 0.05
+            robot.set_state(there, fast)
+            pairs = enumerate(zip(before, observed(task, env), strict=True))
+            found.append({agent for agent, (a, b) in pairs if not np.array_equal(a, b)})
+        return found
+
+    joints = model.actuator_trnid[:, 0]
+    by_actuator = [seen_at(model.jnt_qposadr[j], model.jnt_dofadr[j]) for j in joints]
+    others = sorted(set(range(model.njnt)) - set(joints.tolist()))
+    by_root = [seen_at(model.jnt_qposadr[j], model.jnt_dofadr[j]) for j in others]
+    env.close()
+    return by_actuator, by_root
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"{s}-{p}" for s, partitions in KNOWN_PARTITIONS.items() for p in partitions),
+        *("ManySegmentAnt-2x1", "ManySegmentAnt-5x1", "ManySegmentSwimmer-3x3"),
+    ],
+)
+def test_who_moves_a_joint_and_nobody_else_sees_it(name):
+    task = make_task(f"mamujoco/{name}")
+    by_actuator, by_root = seeing(task)
+    for agent, actuators in enumerate(task.spec.action_index):
+        for actuator in actuators:
+            assert by_actuator[actuator] == [{agent}, {agent}], (agent, actuator)
+    # The library shows each agent of the short Swimmer one of the root's velocities on purpose.
+    shown = {(0, 1): {0}, (1, 1): {1}} if name == "Swimmer-2x1" else {}
+    for joint, found in enumerate(by_root):
+        for kind, agents in enumerate(found):
+            assert agents == shown.get((joint, kind), set())
+
+
+def test_segments_of_the_long_ant_see_their_neighbours_hips():
+    config = EnvConfig(agent_obsk=1)
+    by_actuator, _ = seeing(make_task("mamujoco/ManySegmentAnt-4x1", config))
+    # Of each segment hip, ankle, hip, ankle; hips hang on those of the segments before and behind.
+    for actuator, (position, velocity) in enumerate(by_actuator):
+        segment, is_hip = actuator // 4, actuator % 2 == 0
+        near = {segment - 1, segment, segment + 1} & set(range(4)) if is_hip else {segment}
+        assert position == velocity == near, actuator

@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 
 from race.envs.discrete_probe import make_task
 from race.envs.pymarl import PymarlEnv, pymarl_task
-from race.errors import RenderError, TaskError
+from race.errors import HandedOverError, RenderError, TaskError
 from race.types import DiscreteSpec
 
 LIMIT = 4
@@ -69,6 +69,28 @@ class TellsSeed(Game):
     def seed(self) -> int:
         self.calls.append("asked")
         return 5
+
+
+class ResetsSeeded(Game):
+    """As in EPyMARL; its attribute ``seed`` is no method."""
+
+    seed = None
+
+    def reset(self, seed: int | None = None, options: Any = None) -> Any:
+        self.calls.append(("reset", seed))
+        return self.get_obs(), {}
+
+
+class Both(ResetsSeeded):
+    def seed(self, seed: int) -> None:  # type: ignore[override, assignment]
+        self.calls.append(("seed", seed))
+
+
+class AnyKeyword(Game):
+    """Hands its keywords on, to what may not know them."""
+
+    def reset(self, **keywords: Any) -> None:
+        super().reset(**keywords)
 
 
 class Drawn(Game):
@@ -193,6 +215,9 @@ def test_wins_are_told(facts: dict[str, Any], has_wins: bool, told: list[Any]) -
     ("game", "calls"),
     [
         (Seeded(), [("seed", 3), "reset", "reset"]),
+        (ResetsSeeded(), [("reset", 3), ("reset", None)]),
+        (Both(), [("seed", 3), ("reset", 3), ("reset", None)]),
+        (AnyKeyword(), ["reset", "reset"]),
         (TellsSeed(), ["reset", "reset"]),
         (Game(), ["reset", "reset"]),
     ],
@@ -202,6 +227,9 @@ def test_seeds_are_handed_on_where_they_are_taken(game: Game, calls: list[Any]) 
     env.reset(seed=3)
     env.reset()
     assert game.calls == calls
+    calls.clear()
+    kind = type(game)
+    assert pymarl_task(kind, "mine").seeded == (kind in (Seeded, ResetsSeeded, Both))
 
 
 def test_pictures() -> None:
@@ -260,12 +288,14 @@ def test_get_env_info_that_is_no_dictionary() -> None:
 @pytest.mark.parametrize(
     ("method", "answer", "told"),
     [
-        ("get_obs", [np.zeros(2)], r"get_obs returned shape \(1, 2\).*\(2, 2\)"),
-        ("get_obs", [np.zeros(2), np.zeros(3)], "get_obs returned what is no array"),
+        ("get_obs", [np.zeros(2)], r"get_obs returned has shape \(1, 2\).*\(2, 2\)"),
+        ("get_obs", [np.zeros(2), np.zeros(3)], r"get_obs returned is no array of shape \(2, 2\)"),
         ("get_obs", None, "get_obs returned"),
-        ("get_state", np.zeros((1, 1)), r"get_state returned shape \(1, 1\).*\(1,\)"),
-        ("get_state", [{}], "get_state returned what is no array"),
-        ("get_avail_actions", [[1, 1, 1]], r"get_avail_actions returned shape \(1, 3\)"),
+        ("get_obs", [[0.0, 1.0], [np.inf, 0.0]], r"entry \(1, 0\) of what get_obs returned is inf"),
+        ("get_state", np.zeros((1, 2)), r"get_state returned has shape \(1, 2\).*\(1,\)"),
+        ("get_state", [{}], r"get_state returned is a list of 1 \(dict\)"),
+        ("get_avail_actions", [[1, 1, 1]], r"get_avail_actions returned has shape \(1, 3\)"),
+        ("get_avail_actions", [[1, 0, 0], [-1, 1, 0]], "has the entry -1"),
         ("get_avail_actions", [[1, 0, 0], [0, 0, 0]], "no action is available to agent 1"),
         ("get_avail_actions", [[1, 0, 0], [1, float("nan"), 0]], "must say 1 or 0 of every action"),
         ("get_avail_actions", [[1, 0, 0], [2, 0, 0]], "must say 1 or 0 of every action"),
@@ -278,13 +308,55 @@ def test_what_is_shown_must_fit(method: str, answer: Any, told: str) -> None:
 
 @pytest.mark.parametrize(
     "answer",
-    [None, (0.0, False), ({}, 0.0, False, False, {}), ([1.0, 1.0], False, {}), (1.0, False, 3)],
+    [None, (0.0, False), (0.0, False, False, {}), (1.0, False, 3), {"reward": 1.0}],
 )
 def test_steps_must_answer_as_pymarl_s_do(answer: Any) -> None:
     env = answering("step", answer)
     env.reset()
     with pytest.raises(TaskError, match=r"step must return \(reward, terminated, info\)"):
         env.step(np.array([1, 0]))
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (([1.0, 1.0], False, {}), "after 1 steps: the reward is a list of 2"),
+        ((1.0, [False, True], {}), r"terminated is a list of 2 \(False, True\)"),
+        ((1.0, {"agent_0": True}, {}), "terminated is a dictionary"),
+        ((1.0, "False", {}), "terminated is str 'False'"),
+        ((1.0, True, {"episode_limit": 25}), r'info\["episode_limit"\] is int 25'),
+        ((None, 1.0, False, [True], {}), None),
+        ((None, 1.0, False, [True, False], {}), "truncated is a list of 2"),
+    ],
+)
+def test_what_steps_answer_must_be_for_the_whole_team(answer: Any, told: str | None) -> None:
+    env = answering("step", answer)
+    env.reset()
+    if told is None:  # one agent's list says what is plainly meant
+        assert env.step(np.array([1, 0]))[2:4] == (False, True)
+        return
+    with pytest.raises(HandedOverError, match=told):
+        env.step(np.array([1, 0]))
+
+
+@pytest.mark.parametrize(
+    ("terminated", "truncated", "limit", "ends"),
+    [
+        (False, True, False, (False, True)),
+        (True, False, False, (True, False)),
+        (True, True, False, (True, False)),  # an end of its own, at the moment of the limit
+        (True, False, True, (False, True)),
+        (1, np.bool_(False), 0, (True, False)),
+    ],
+)
+def test_steps_as_in_epymarl(
+    terminated: Any, truncated: Any, limit: Any, ends: tuple[bool, bool]
+) -> None:
+    answer = ([0], np.array([2.0]), terminated, truncated, {"episode_limit": limit})
+    env = answering("step", answer)
+    env.reset()
+    _, reward, *told, _ = env.step(np.array([1, 0]))
+    assert (reward, tuple(told)) == (2.0, ends)
 
 
 def test_episodes_must_end_by_their_limit() -> None:

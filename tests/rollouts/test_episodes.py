@@ -25,6 +25,7 @@ from race.rollouts.choosing import Exploration
 from race.rollouts.discrete import EpisodeRollouts
 from race.rollouts.episodes import Played, empty_episode
 from race.rollouts.host_episodes import HostEnvs
+from race.rollouts.pool import EnvPool
 from race.types import DeviceEnv, DiscreteSpec, DiscreteTask, Observation, Outcome
 
 BATTLE_STEPS = 5
@@ -77,7 +78,7 @@ def play(
         assert task.device is not None
         played = device.play(task.device(), teams, seeds, how, task.spec, precision)
         return jax.tree.map(np.asarray, played)
-    with HostEnvs(task) as envs:
+    with HostEnvs(EnvPool(task, len(seeds), processes=False)) as envs:
         return envs.play(teams, seeds, how, precision)
 
 
@@ -295,7 +296,7 @@ def test_environments_that_are_used_again_remember_nothing(
     if on_device:
         first, _, again = (play(COUNTDOWN, teams, seeds) for seeds in SEEDS)
     else:
-        with HostEnvs(COUNTDOWN) as envs:
+        with HostEnvs(EnvPool(COUNTDOWN, 5, processes=False)) as envs:
             assert not made  # not before they are needed
             first, _, again = (envs.play(teams, s, None, "float32") for s in SEEDS)
             assert len(made) == 5
@@ -506,16 +507,24 @@ def test_the_program_is_traced_once_for_all_that_has_its_shape() -> None:
 @pytest.mark.parametrize(
     ("failure", "told"),
     [
-        ("reset", r"countdown failed \(environment \d\): OSError: no game here, in .*, line \d+"),
+        ("reset", r"countdown failed in the reset .*: OSError: no game here, in .*, line \d+"),
         (
             "step",
-            r"countdown failed \(environment \d\): OSError: the game is gone, in .*, line",
+            r"countdown failed at step 2 .*: OSError: the game is gone, in .*episodes.py, lin",
         ),
-        ("info", r"countdown failed \(environment \d\): AttributeError: 'NoneType' .*'get'"),
-        ("shape", r"countdown shows state of the shape \(1,\); its DiscreteSpec says \(2,\)"),
-        ("key", r"countdown failed \(environment \d\): KeyError: 'state'"),
-        ("idle", "countdown offers agent 1 no action"),
+        ("info", r"countdown broke the contract at step 1 .*: step returned a tuple of 5 .*None"),
+        (
+            "shape",
+            r"countdown broke .* in the reset .*: state has shape \(1,\), .* task says \(2,\)",
+        ),
+        (
+            "key",
+            r"a dictionary \('obs', 'avail_actions'\), but must be a dictionary of obs \[2, 2\]",
+        ),
+        ("idle", r"at step 1 .*: no action is available to agent 1.*Countdown.step: .*, line \d+"),
         ("told", "^What to do about it.$"),
+        ("reward", "at step 1 of the episode .*: the reward is nan. That is no number"),
+        ("nan", r"in the reset of the episode .*: entry \(1, 0\) of obs is nan. That is no number"),
     ],
 )
 def test_an_environment_that_fails_names_its_task(
@@ -529,24 +538,6 @@ def test_an_environment_that_fails_names_its_task(
         rollouts.play(teams_of(task.spec, 5), 0, 0, rollouts.empty_replay())
     assert made
     assert all(env.closed for env in made)
-
-
-def test_rewards_that_are_not_finite_are_refused(made: list[Countdown]) -> None:
-    config, task = config_of("countdown"), broken("reward")
-    with (
-        EpisodeRollouts(config, task) as rollouts,
-        pytest.raises(DivergenceError, match="return of team 0 in generation 8 is nan"),
-    ):
-        rollouts.play(teams_of(task.spec, 5), 7, 0, rollouts.empty_replay())
-
-
-def test_observations_that_are_no_numbers_are_refused(made: list[Countdown]) -> None:
-    told = "gave an observation in generation 8, after 0 steps, with the entry nan. That is no num"
-    with (
-        EpisodeRollouts(config_of("countdown"), broken("nan")) as rollouts,
-        pytest.raises(DivergenceError, match=told),
-    ):
-        rollouts.play(teams_of(COUNTDOWN.spec, 5), 7, 0, rollouts.empty_replay())
 
 
 def test_observations_too_large_for_the_buffer_are_refused(made: list[Countdown]) -> None:

@@ -188,6 +188,7 @@ def test_what_is_no_archive_says_so(tmp_path: Path) -> None:
 def test_settings_of_an_older_version_are_what_it_did(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run")
     data = json.loads((run / "config.json").read_text())
+    del data["run"], data["digest"]
     for group, name in (("learner", "layer_norm"), ("facmac", "layer_norm")):
         del data[group][name]
     for name in ("mutation_draw", "elite_copy"):

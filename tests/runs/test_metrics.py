@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from race.errors import RunDirectoryError
 from race.runs import metrics
-from race.runs.metrics import MetricsWriter, read
+from race.runs.metrics import Extent, MetricsWriter, read
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def write(path: Path, *numbers: int, offset: int | None = None) -> int:
-    with MetricsWriter(path, offset) as writer:
+    with MetricsWriter(path, None if offset is None else Extent(offset)) as writer:
         for number in numbers:
             writer.write({"n": number})
         return writer.offset
@@ -31,7 +31,7 @@ def numbers(path: Path) -> list[int]:
 
 
 def test_rows_come_back_in_order_and_each_is_one_line(path: Path) -> None:
-    rows = [{"kind": "generation", "text": "two\nlines é", "nested": {"a": [1, None]}}, {}]
+    rows = [{"kind": "note", "text": "two\nlines é", "nested": {"a": [1, None]}}, {}]
     with MetricsWriter(path) as writer:
         for row in rows:
             writer.write(row)
@@ -134,8 +134,54 @@ def test_offsets_that_do_not_fit_the_file_are_refused_and_change_nothing(path: P
     content = path.read_bytes()
     for wrong, told in ((offset + 1, "rows are missing"), (offset - 1, "no end of a row")):
         with pytest.raises(RunDirectoryError, match=told):
-            MetricsWriter(path, wrong)
+            MetricsWriter(path, Extent(wrong))
         assert path.read_bytes() == content
+
+
+def test_rows_that_were_changed_are_refused_and_stay(path: Path) -> None:
+    with MetricsWriter(path, run="abc") as writer:
+        for number in (1, 2):
+            writer.write({"n": number})
+        kept = writer.extent
+        writer.write({"n": 3})
+    assert read(path, "abc", kept)[0] == {"n": 1, "run": "abc"}
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b'"n": 2', b'"n": 7'))
+    for use in (lambda: read(path, "abc", kept), lambda: MetricsWriter(path, kept, "abc")):
+        with pytest.raises(RunDirectoryError, match=r"not those .* resume .* --without-metrics"):
+            use()
+    path.write_bytes(content.replace(b'"n": 3', b'"n": 7'))  # nobody has vouched for it
+    assert read(path, "abc", kept)[2] == {"n": 7}
+    with pytest.raises(RunDirectoryError, match=r"another run \(abc\) than .* \(def\)"):
+        read(path, "def")
+    with MetricsWriter(path, kept, "abc") as writer:
+        assert writer.extent == kept
+        writer.write({"n": 4})
+        grown = writer.extent
+        writer.write({"n": 5})
+        writer.forget(grown.offset)
+        assert writer.extent == grown
+    assert [row["n"] for row in read(path, "abc", grown)] == [1, 2, 4]
+
+
+@pytest.mark.parametrize("value", ["1", 1.5, -1, True, None, 10**30, [1], float("nan")])
+def test_steps_that_no_run_makes_are_named(path: Path, value: Any) -> None:
+    good = {"kind": "evaluation", "env_steps": 5, "wall_seconds": 0.5}
+    for name in ("env_steps", "wall_seconds"):
+        if name == "wall_seconds" and value == 1.5:
+            continue
+        path.write_text(json.dumps(good) + "\n" + json.dumps(good | {name: value}) + "\n")
+        with pytest.raises(RunDirectoryError, match=f"Line 2 of .*its {name} are"):
+            read(path)
+    path.write_text(json.dumps({"kind": "generation"}) + "\n")
+    with pytest.raises(RunDirectoryError, match=r"Line 1 of .*its env_steps are None"):
+        read(path)
+
+
+def test_rows_nested_without_end_are_named(path: Path) -> None:
+    path.write_text('{"n": ' + "[" * 100_000 + "]" * 100_000 + "}\n")
+    with pytest.raises(RunDirectoryError, match=r"Line 1 of .*nested too deeply"):
+        read(path)
 
 
 def test_files_that_cannot_be_opened_are_told(path: Path, tmp_path: Path) -> None:

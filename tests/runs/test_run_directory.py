@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,8 +18,10 @@ from race.runs import directory as run_directory
 from race.runs import metadata
 from race.runs.directory import (
     RunDirectory,
+    change_config,
     clear_finished,
     create,
+    identity_of,
     is_finished,
     lock,
     mark_finished,
@@ -165,6 +168,8 @@ def test_folders_that_are_no_run_are_refused(tmp_path: Path) -> None:
         ('{"task": ', "no JSON object"),
         ("\xff", "no JSON object"),
         ("[]", "no JSON object"),
+        ("[" * 100_000, "nested too deeply"),
+        ('{"a":' * 100_000, "nested too deeply"),
         ('{"task": "a"}', "does not fit"),
     ],
 )
@@ -174,9 +179,51 @@ def test_a_config_that_cannot_be_read_is_told(tmp_path: Path, text: str, told: s
         open_run(tmp_path)
 
 
+def unsealed(path: Path) -> dict[str, Any]:
+    """The configuration of a run, as versions before seals and identities wrote it."""
+    body = json.loads((path / "config.json").read_text())
+    assert len(body.pop("digest")) == 32
+    assert len(body.pop("run")) == 16
+    return dict(body)
+
+
+def test_each_run_has_an_identity_which_stays(path: Path, tmp_path: Path) -> None:
+    create(path, CONFIG)
+    create(tmp_path / "two", CONFIG)
+    identity = identity_of(path)
+    assert identity != identity_of(tmp_path / "two")
+    change_config(path, dataclasses.replace(CONFIG, env_steps=7_000_000))
+    assert identity_of(path) == identity
+    assert open_run(path).env_steps == 7_000_000
+    # A run of before stays one.
+    (path / "config.json").write_text(json.dumps(unsealed(path)))
+    assert identity_of(path) is None
+    change_config(path, CONFIG)
+    assert identity_of(path) is None
+
+
+def test_a_config_that_was_changed_by_hand_is_refused(path: Path) -> None:
+    create(path, CONFIG)
+    text = (path / "config.json").read_text()
+    body = json.loads(text)
+    changed = [
+        text.replace('"seed": 3', '"seed": 4'),
+        text.replace('"digest"', '"digset"'),
+        json.dumps({k: v for k, v in body.items() if k != "digest"}),
+        json.dumps({k: v for k, v in body.items() if k != "run"}),
+        json.dumps(body | {"run": "0" * 16}),
+    ]
+    for other in changed:
+        (path / "config.json").write_text(other)
+        with pytest.raises(RunDirectoryError, match="changed since race wrote it"):
+            open_run(path)
+    (path / "config.json").write_text(json.dumps(body))  # as some tools write it
+    assert open_run(path) == CONFIG
+
+
 def test_a_config_with_a_foreign_field_is_told(path: Path) -> None:
     run = create(path, CONFIG)
-    data = json.loads(run.config.read_text())
+    data = unsealed(path)
     data["learner"]["momentum"] = 0.9
     run.config.write_text(json.dumps(data))
     with pytest.raises(RunDirectoryError, match="momentum"):
@@ -199,6 +246,7 @@ def test_finished_can_be_marked_and_taken_back(path: Path) -> None:
 HOLDS = """
 import fcntl, sys, time
 from pathlib import Path
+from typing import Any
 from race.runs.directory import lock
 with lock(Path(sys.argv[1])):
     print("locked", flush=True)
@@ -234,12 +282,13 @@ def test_the_lock_of_a_killed_process_is_free_again(tmp_path: Path) -> None:
         process.send_signal(signal.SIGKILL)
         process.wait()
     with lock(tmp_path):
-        assert RunDirectory(tmp_path).lock.read_text() == f"{os.getpid()}\n"
+        assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
 
 
 FORKS_AND_IS_KILLED = """
 import os, signal, sys
 from pathlib import Path
+from typing import Any
 from race.runs.directory import lock
 with lock(Path(sys.argv[1])):
     if os.fork() == 0:
@@ -289,7 +338,7 @@ def test_a_config_with_a_wrong_value_is_refused(
     path: Path, group: str, name: str, value: object
 ) -> None:
     create(path, CONFIG)
-    saved = json.loads((path / "config.json").read_text())
+    saved = unsealed(path)
     saved[group][name] = value
     (path / "config.json").write_text(json.dumps(saved))
     with pytest.raises(RunDirectoryError, match=name.replace("_", "[-_]")):

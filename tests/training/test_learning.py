@@ -21,7 +21,8 @@ from race.envs import make_task
 from race.envs.probe import LAST, ChainEnv, TargetEnv
 from race.learners import learner_of
 from race.replay.buffer import init_replay
-from race.rollouts.host import EnvPool, collect
+from race.rollouts.host import collect
+from race.rollouts.pool import EnvPool
 from race.rollouts.transitions import empty_transition, store
 from race.training.run_state import statics
 from race.types import Task, Transition

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from race.errors import CheckpointError, ConfigError
+from race.errors import CheckpointError, ConfigError, HandedOverError
 from race.runs import archive
 from race.runs import directory as run_directory
 from race.runs.results import load
@@ -35,6 +35,9 @@ def test_its_team_plays(old: Path) -> None:
         action = trained.policy(team)(np.zeros(trained.task.spec.state_size, np.float32))
         assert action.shape == (trained.task.spec.joint_action_size,)
         assert np.isfinite(action).all()
+        for wrong in (np.zeros(trained.task.spec.state_size + 1), np.full_like(action, np.nan)):
+            with pytest.raises(HandedOverError, match="The team was shown what no environment of"):
+                trained.policy(team)(wrong)
 
 
 def test_it_is_drawn_and_archived(old: Path, tmp_path: Path) -> None:

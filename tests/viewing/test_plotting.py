@@ -245,6 +245,8 @@ def test_the_band_of_a_share_stays_within_0_and_1(
 def test_wall_time_on_the_axis(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", [(100, 50.0), (200, 60.0)])
     text = (run / "metrics.jsonl").read_text()
-    (run / "metrics.jsonl").write_text(text.replace('"env_steps": 200', '"wall_seconds": 90.0'))
+    (run / "metrics.jsonl").write_text(
+        text.replace('"env_steps": 200', '"env_steps": 200, "wall_seconds": 90.0')
+    )
     (summary,) = plot([run], tmp_path / "a.png", axis="wall_time").summaries
     assert summary.x == 1.5

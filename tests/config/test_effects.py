@@ -1,0 +1,112 @@
+"""Settings without effect are refused, and no others."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from race.config.effects import refuse_without_effect
+from race.config.hyper import hyper_of
+from race.config.presets import PRESETS, resolve
+from race.config.settings import Config, EnvConfig, FacmacConfig, LearnerConfig, RaceConfig
+from race.config.shape import shape_of
+from race.errors import ConfigError
+
+METHODS = [
+    *((algo, base, False) for algo, base in (("race", "matd3"), ("race", "maddpg"))),
+    *(("race", "facmac", False), ("matd3", None, False), ("maddpg", None, False)),
+    *(("facmac", None, False), ("facmac", None, True), ("race", None, True)),
+]
+ON_HOST = {
+    False: {"exploration_noise", "replay_capacity", "random_steps", "gradient_steps_per_env_step"},
+    True: {
+        *("replay_capacity", "replay_precision", "gradient_steps_per_episode"),
+        *("epsilon_start", "epsilon_finish", "epsilon_steps"),
+    },
+}
+OTHER: dict[str, Any] = {
+    **{"replay_precision": "float16", "mutation_draw": "weight"},
+    **{"mutation_fraction": 0.25, "vmm_weight": 0.03},
+}
+SETTINGS = [
+    (group, field.name)
+    for group, kind in (("learner", LearnerConfig), ("facmac", FacmacConfig), ("race", RaceConfig))
+    for field in dataclasses.fields(kind)
+]
+
+
+def other(name: str, value: Any) -> Any:
+    if name in OTHER:
+        return OTHER[name]
+    if isinstance(value, bool):
+        return not value
+    if isinstance(value, tuple):
+        return tuple(size + 1 for size in value)
+    return value + 1 if isinstance(value, int) else value / 2
+
+
+def refused(config: Config, **facts: bool) -> str:
+    defaults = {"discrete": False, "reads_env": True, "on_host": True}
+    try:
+        refuse_without_effect(config, PRESETS["paper"], **(defaults | facts))
+    except ConfigError as error:
+        return str(error)
+    return ""
+
+
+@pytest.mark.parametrize(("algo", "base", "discrete"), METHODS)
+def test_a_setting_is_refused_exactly_if_nothing_reads_it(
+    algo: Any, base: Any, discrete: bool
+) -> None:
+    plain = Config("some-task", algo=algo, base=base)
+    resolved = resolve(plain, discrete=discrete)
+    assert refused(plain, discrete=discrete) == ""
+    for group, name in SETTINGS:
+        settings = getattr(plain, group)
+        value = other(name, getattr(settings, name))
+        assert value != getattr(settings, name)
+        changed = dataclasses.replace(
+            plain, **{group: dataclasses.replace(settings, **{name: value})}
+        )
+        new = resolve(changed, discrete=discrete)
+        read = (shape_of(new), str(hyper_of(new))) != (shape_of(resolved), str(hyper_of(resolved)))
+        mine = group == ("facmac" if discrete else "learner")
+        read |= mine and name in ON_HOST[discrete]
+        read &= name != "value_size" or changed.has_population  # the state-value net is RACE's
+        told = refused(changed, discrete=discrete)
+        option = f"--{group}.{name.replace('_', '-')} would have no effect"
+        assert (option in told) == (not read), (group, name, told)
+
+
+@pytest.mark.parametrize(
+    ("env", "facts", "told"),
+    [
+        ({"agent_obsk": 1}, {"reads_env": False}, "--env.agent-obsk would have no effect"),
+        (
+            {"agent_obsk": 1, "library_observation": True},
+            {},
+            "--env.agent-obsk would have no effect with --env.library-observation",
+        ),
+        ({"agent_obsk": 1}, {}, ""),
+        ({"library_observation": True}, {}, ""),
+        ({"processes": False}, {"on_host": False}, "--env.processes would have no effect"),
+        ({"retries": 0, "step_seconds": 3.0}, {"on_host": False}, "--env.retries and --env.step-"),
+        ({"retries": 0, "step_seconds": 3.0}, {}, ""),
+    ],
+)
+def test_settings_of_environments(env: dict[str, Any], facts: dict[str, bool], told: str) -> None:
+    found = refused(Config("some-task", env=EnvConfig(**env)), **facts)
+    assert told in found
+    assert bool(told) == bool(found)
+
+
+def test_a_base_beside_another_algorithm_is_refused() -> None:
+    assert "--base would have no effect with --algo matd3" in refused(
+        Config("some-task", algo="matd3", base="maddpg")
+    )
+    assert refused(Config("some-task", algo="matd3", base="matd3")) == ""
+
+
+def test_presets_are_no_wish_of_the_users() -> None:
+    config = Config("some-task", algo="maddpg", learner=PRESETS["td3"])
+    refuse_without_effect(config, PRESETS["td3"], discrete=False, reads_env=True, on_host=True)
