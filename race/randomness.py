@@ -17,6 +17,7 @@ class Purpose(IntEnum):
     EVOLUTION = 3
     LEARNING = 4
     EVALUATION = 5
+    INJECTION = 6
 
 
 def root_key(seed: int, purpose: Purpose) -> PRNGKeyArray:

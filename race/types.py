@@ -108,6 +108,17 @@ class Slots(NamedTuple):
     real: Bool[Any, "L R"]  # there is something here
 
 
+class Team(NamedTuple):
+    """A team, or what of it evolves; with further leading axes many of them.
+
+    ``encoder`` is a pytree whose leaves begin with the agents' axis, or None where all teams share
+    one and the heads alone are a team's own. In `heads`, the last row holds the biases.
+    """
+
+    encoder: Any
+    heads: Float[Any, "*b N H1 A"]
+
+
 class Rollout(NamedTuple):
     """What one batch of episodes brought back to the host, one episode per acting team.
 

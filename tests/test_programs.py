@@ -38,6 +38,16 @@ OTHER_RACE = {
     "vmm_weight": 0.3,
     "mutation_probability": 0.5,
     "agent_mutation_probability": 0.9,
+    "crossover_probability": 0.7,
+    "injection_probability": 0.8,
+    "strong_share": 0.1,
+    "reset_share": 0.2,
+    "strong_strength": 5.0,
+    "mild_strength": 0.2,
+    "largest_weight": None,
+    "vfm_marl_weight": 0.5,
+    "vfm_team_weight": 0.0,
+    "value_awareness": 0.0,
 }
 
 

@@ -33,8 +33,8 @@ class Algorithm(NamedTuple):
     update: Callable[..., tuple[Any, Losses, Losses]]
     """(state, batch, step, key, spec, shape, hyper) -> state, critic losses, policy losses; lines
     8, 10 and 13. Policy losses are zero on steps where the policy delay idles."""
-    inject: Callable[[Any], Any]
-    """state -> state; line 11."""
+    inject: Callable[..., Any]
+    """(state, key, hyper) -> state; line 11."""
     injection_counts: Callable[[Any], Array | np.ndarray]
     """state -> how often the injected team became elite, parent, discarded; shape [3]."""
     critic_losses: tuple[str, ...]

@@ -122,7 +122,7 @@ def _evolve(
     return state
 
 
-def _inject(state: MarlState) -> MarlState:
+def _inject(state: MarlState, key: PRNGKeyArray, hyper: Hyper) -> MarlState:
     return state
 
 

@@ -20,6 +20,7 @@ from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
 from race.learners.base import Samples
+from race.method.crossover import breed, inject
 from race.method.equations import (
     best_target,
     encoder_loss,
@@ -31,9 +32,10 @@ from race.method.equations import (
     value_function_maximization_loss,
     value_weights,
 )
-from race.method.genetics import breed, inject, mutate_population, select
-from race.networks.optimization import copy, descend, init_trainable
-from race.types import Spec
+from race.method.mutation import mutate_population
+from race.method.selection import select
+from race.networks.optimization import copy, descend, graft, init_trainable, weigh_gradient
+from race.types import Spec, Team
 
 
 class Targets(NamedTuple):
@@ -84,15 +86,15 @@ def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> RaceState:
     pevfa = learner.init_pevfa(keys[3], spec, shape)
     value = learner.init_value(keys[4], spec, shape)
     mine = learner.init_mine(keys[5], spec, shape)
-    heads = [
-        learner.init_heads(team_key, spec, shape)
-        for team_key in jax.random.split(keys[6], shape.population_size)
-    ]
+    # Vmapped, since a program of hundreds of teams one after the other takes minutes to compile.
+    heads = jax.vmap(lambda team_key: learner.init_heads(team_key, spec, shape))(
+        jax.random.split(keys[6], shape.population_size)
+    )
     return RaceState(
         policies=Policies(*map(init_trainable, (encoder, head, mine))),
         critics=Critics(*map(init_trainable, (critic, pevfa, value))),
         target=copy(Targets(encoder, head, critic, pevfa)),
-        heads=jnp.stack(heads),
+        heads=heads,
         elite=jnp.zeros((), jnp.int32),
         worst=jnp.zeros((), jnp.int32),
         injected=jnp.full((), -1, jnp.int32),
@@ -121,24 +123,26 @@ def evolve(
 ) -> RaceState:
     """Line 9: selection, agent-level crossover and mutation; and what became of the injected."""
     select_key, breed_key, mutate_key = jax.random.split(key, 3)
-    chosen = select(fitness, shape.tournament_size, select_key)
-    heads = breed(state.heads, chosen, breed_key, shape.elite_copy)
-    heads = mutate_population(
-        heads,
-        chosen.elite,
-        jnp.asarray(spec.action_mask),
-        hyper.mutation_fraction,
-        hyper.mutation_probability,
-        hyper.agent_mutation_probability,
-        mutate_key,
-        shape.mutation_draw,
+    mask = jnp.asarray(spec.action_mask)
+    chosen = select(fitness, shape.tournament_size, select_key, spec.n_agents)
+    bred = breed(
+        Team(None, state.heads),
+        chosen,
+        mask,
+        hyper.crossover_probability,
+        breed_key,
+        shape.elite_copy,
+        "agent",
+    )
+    teams, _ = mutate_population(
+        bred.teams, chosen.elite, mask, hyper, mutate_key, shape.mutation_draw, "agent"
     )
     is_elite = state.injected == chosen.elite
-    is_parent = state.injected == chosen.parent
+    is_parent = state.injected == chosen.parent[0]
     is_discarded = (state.injected >= 0) & ~is_elite & ~is_parent
     fate = jnp.stack([is_elite, is_parent, is_discarded]).astype(jnp.int32)
     return state._replace(
-        heads=heads,
+        heads=teams.heads,
         elite=chosen.elite.astype(jnp.int32),
         worst=chosen.worst.astype(jnp.int32),
         injection_counts=state.injection_counts + fate,
@@ -239,17 +243,26 @@ def _train_policies(
     marl_key, team_key, pairs_key = jax.random.split(key, 3)
     critic = learner.first_critic(state.critics.critic.params)
     pevfa = learner.first_pevfa(state.critics.pevfa.params)
-    weights = value_weights(value, mask)
+    weights = value_weights(value, mask, hyper.value_awareness)
 
     def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
         z = learner.encode(policies.encoder, now, spec)
-        marl_action = learner.act(z, policies.head, now, marl_key, spec)
+        # The weights of Eq. (2)'s terms are of what goes on into the encoders: W_marl learns by
+        # Eq. (7) whatever they are. They multiply gradients of actions, the smallest arrays there
+        # are.
+        fixed_z, fixed_head = jax.lax.stop_gradient((z, policies.head))
+        of_encoder = learner.act(z, fixed_head, now, marl_key, spec)
+        marl_action = graft(
+            learner.act(fixed_z, policies.head, now, marl_key, spec),
+            weigh_gradient(of_encoder, hyper.vfm_marl_weight),
+        )
         team_action = learner.act(z, team, now, team_key, spec)
+        team_action = weigh_gradient(team_action, hyper.vfm_team_weight)
         q_marl = learner.q_marl(critic, now, marl_action, spec)[0]
         q_team = learner.q_team(pevfa, now, team_action, team, spec)[0]
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
         # held fixed. Both are the same numbers and are computed once.
-        fixed_mine, fixed_z = jax.lax.stop_gradient((policies.mine, z))
+        fixed_mine = jax.lax.stop_gradient(policies.mine)
         signal = learner.mutual_information(fixed_mine, now, z, pairs_key)
         plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key)
         vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None))(weights, signal, mask)
@@ -283,10 +296,14 @@ def _train_policies(
     return state._replace(policies=policies, target=target), losses
 
 
-def inject_marl(state: RaceState) -> RaceState:
+def inject_marl(state: RaceState, key: PRNGKeyArray, hyper: Hyper) -> RaceState:
     """Line 11: the MARL team replaces the team of lowest fitness (never the elite)."""
-    heads = inject(state.heads, _marl_team(state), state.worst)
-    return state._replace(heads=heads, injected=state.worst)
+    happens = jax.random.uniform(key) < hyper.injection_probability
+    teams = inject(Team(None, state.heads), Team(None, _marl_team(state)), state.worst)
+    return state._replace(
+        heads=jnp.where(happens, teams.heads, state.heads),
+        injected=jnp.where(happens, state.worst, -1),
+    )
 
 
 def _champion(state: RaceState) -> Float[Array, "N H1 A"]:

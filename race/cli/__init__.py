@@ -21,7 +21,7 @@ COMMANDS = {
     "render": "make a video of a trained team, or of a battle",
     "plot": "draw learning curves of one or more runs",
     "archive": "put the results of many runs into one small file",
-    "list": "show tasks, algorithms and presets",
+    "list": "show tasks, algorithms, ablations and presets",
     "bench": "measure speed and memory on this machine",
     "doctor": "show what is installed, what is missing and how to mend it",
 }

@@ -7,6 +7,7 @@ from typing import get_args
 
 import tyro
 
+from race.config.ablations import ABLATIONS
 from race.config.presets import PRESETS, TABLES
 from race.config.settings import Algo
 
@@ -21,7 +22,7 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class List:
-    """Show tasks, algorithms and presets."""
+    """Show tasks, algorithms, ablations and presets."""
 
     json: bool = False
     """Print one JSON object instead of tables."""
@@ -46,6 +47,7 @@ def main(arguments: list[str]) -> None:
                 for info in tasks
             ],
             "algorithms": ALGORITHMS,
+            "ablations": {name: ablation._asdict() for name, ablation in ABLATIONS.items()},
             "presets": {name: dataclasses.asdict(preset) for name, preset in PRESETS.items()},
         }
         print(json.dumps(listing, indent=2))
@@ -66,6 +68,10 @@ def main(arguments: list[str]) -> None:
     for name, what in ALGORITHMS.items():
         algorithms.add_row(name, what)
     console.print(algorithms)
+    ablations = Table("--ablation", "what is left of RACE", title="Ablations")
+    for name, ablation in ABLATIONS.items():
+        ablations.add_row(name, ablation.description)
+    console.print(ablations)
     presets = Table("--preset", "settings", title="Presets of the learner")
     for name, preset in PRESETS.items():
         presets.add_row(

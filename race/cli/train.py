@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from race.config.ablations import AblationName, ablated
 from race.config.effects import refuse_without_effect
 from race.config.presets import PRESETS, resolve
 from race.config.settings import (
@@ -42,6 +43,8 @@ class Train:
     """race, or one of its baselines without a population."""
     base: Base | None = None
     """The gradient learner inside race. None: matd3, on tasks with discrete actions facmac."""
+    ablation: tuple[AblationName, ...] = ()
+    """What to take away from race: one or several of `race list`. Each is a few settings."""
     seed: int = 1
     """Seed of everything random: the same seed gives the same run."""
     seeds: str | None = None
@@ -53,7 +56,8 @@ class Train:
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
     run_dir: Path | None = None
-    """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO."""
+    """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO; names of
+    ablations follow ALGO."""
     preset: Preset = "paper"
     """Learner settings to start from: the paper's, those of the official TD3 code, or small
     networks for a quick look. On tasks with discrete actions there is only the paper's."""
@@ -89,7 +93,7 @@ def main(arguments: list[str]) -> None:
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)
     _refuse_without_effect(asked, chosen.preset, task)
-    config = resolve(asked, discrete=discrete)
+    config = resolve(ablated(asked, chosen.ablation), discrete=discrete)
     if chosen.seeds is None:
         if chosen.jobs is not None:
             raise ConfigError("--jobs has no effect without --seeds. Leave it out.")
@@ -170,7 +174,8 @@ def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None
 
 def _name(config: Config) -> str:
     task = config.task.replace("/", "-").replace(":", "-")
-    return f"{task}-{config.method.replace('(', '-').replace(')', '').lower()}"
+    method = config.method.replace("(", "-").replace(")", "").lower()
+    return "-".join([task, method, *config.ablation])
 
 
 __all__ = ["Train", "main"]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from race.config.settings import Config, EnvConfig, FacmacConfig
+from race.config.settings import Config, EnvConfig, FacmacConfig, RaceConfig
 from race.errors import ConfigError
 
 LARGEST_LAYER = 16_384
@@ -34,8 +34,6 @@ def check(config: Config) -> None:
             f"{config.method} does not work on {config.task}: its actions are discrete, which "
             "facmac alone learns to choose. Use --algo facmac, or --algo race with --base facmac."
         )
-    assert race.mutation_fraction is not None
-    assert race.vmm_weight is not None
     rules: list[Rule] = [
         (1 <= config.env_steps < 2**31, "env-steps", config.env_steps, "from 1 to 2147483647"),
         (
@@ -139,33 +137,7 @@ def check(config: Config) -> None:
             f"the injected MARL team (4 do with --race.no-elite-copy; for no population use --algo "
             f"{config.base})",
         ),
-        (
-            0 <= race.mutation_fraction <= 1,
-            "race.mutation-fraction",
-            race.mutation_fraction,
-            "in [0, 1]",
-        ),
-        (race.vmm_weight >= 0, "race.vmm-weight", race.vmm_weight, "0 or more"),
-        (
-            0 <= race.mutation_probability <= 1,
-            "race.mutation-probability",
-            race.mutation_probability,
-            "in [0, 1]",
-        ),
-        (
-            0 <= race.agent_mutation_probability <= 1,
-            "race.agent-mutation-probability",
-            race.agent_mutation_probability,
-            "in [0, 1]",
-        ),
-        (race.tournament_size >= 1, "race.tournament-size", race.tournament_size, "at least 1"),
-        (
-            race.policy_embedding_size >= 1,
-            "race.policy-embedding-size",
-            race.policy_embedding_size,
-            "at least 1",
-        ),
-        (race.mine_size >= 1, "race.mine-size", race.mine_size, "at least 1"),
+        *_population_rules(race),
         *_env_rules(config.env),
         (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
         (
@@ -211,6 +183,29 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
             "left out with --env.processes False: only a process of its own can be ended",
         ),
     ]
+
+
+def _population_rules(race: RaceConfig) -> list[Rule]:
+    shares = (
+        *("mutation_fraction", "mutation_probability", "agent_mutation_probability"),
+        *("crossover_probability", "injection_probability", "value_awareness"),
+        *("strong_share", "reset_share"),
+    )
+    not_negative = (
+        *("vmm_weight", "vfm_marl_weight", "vfm_team_weight"),
+        *("strong_strength", "mild_strength"),
+    )
+    positive = ("tournament_size", "policy_embedding_size", "mine_size")
+    value = race.__getattribute__
+    rules: list[Rule] = [(0 <= value(name) <= 1, name, value(name), "in [0, 1]") for name in shares]
+    rules += [(value(name) >= 0, name, value(name), "0 or more") for name in not_negative]
+    rules += [(value(name) >= 1, name, value(name), "at least 1") for name in positive]
+    largest, total = race.largest_weight, race.strong_share + race.reset_share
+    rules += [
+        (total <= 1, "reset_share", race.reset_share, "at most 1 together with the strong share"),
+        (largest is None or largest > 0, "largest_weight", largest, "above 0, or None"),
+    ]
+    return [(holds, f"race.{name.replace('_', '-')}", x, must) for holds, name, x, must in rules]
 
 
 def _facmac_rules(facmac: FacmacConfig, n_teams: int) -> list[Rule]:

@@ -32,8 +32,21 @@ class Hyper(NamedTuple):
     """alpha"""
     mutation_probability: Number
     agent_mutation_probability: Number
+    crossover_probability: Number
+    injection_probability: Number
+    strong_share: Number
+    reset_share: Number
+    strong_strength: Number
+    mild_strength: Number
+    largest_weight: Number
+    """Infinite where there is no bound."""
     vmm_weight: Number
     """beta, the weight of Eq. (5) in Eq. (6)."""
+    vfm_marl_weight: Number
+    vfm_team_weight: Number
+    """Weights of the two terms of Eq. (2)."""
+    value_awareness: Number
+    """1: Eq. (5) with its weights; 0: with all weights 1."""
 
 
 def hyper_of(config: Config) -> Hyper:
@@ -49,12 +62,8 @@ def hyper_of(config: Config) -> Hyper:
     shared: Any = facmac if config.discrete else learner
     for name in ("actor_learning_rate", "critic_learning_rate", "gradient_clip", "discount"):
         numbers[name] = getattr(shared, name)
-    of_population = (
-        "mutation_fraction",
-        "mutation_probability",
-        "agent_mutation_probability",
-        "vmm_weight",
-    )
-    for name in of_population:
+    for name in set(Hyper._fields) - set(numbers):  # the rest is the population's
         numbers[name] = getattr(race, name) if config.has_population else unused
+    if numbers["largest_weight"] is None:
+        numbers["largest_weight"] = float("inf")
     return Hyper(**{name: np.float32(number) for name, number in numbers.items()})

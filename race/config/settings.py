@@ -18,6 +18,7 @@ Base = Literal["matd3", "maddpg", "facmac"]
 Preset = Literal["paper", "td3", "demo"]
 ReplayPrecision = Literal["float16", "float32"]
 MutationDraw = Literal["row", "weight"]
+Level = Literal["agent", "parameter", "layer"]
 TeamName = Literal["marl", "champion", "selected"]
 
 
@@ -117,6 +118,17 @@ class RaceConfig:
     vmm_weight: float | None = None
     """Weight of Value-Aware MI Maximization, the paper's beta. None: Tables 3 and 4, else
     0.01."""
+    vfm_marl_weight: float = 1.0
+    """Weight of the MARL team's value in what the encoders climb, the first term of Eq. (2)."""
+    vfm_team_weight: float = 1.0
+    """Weight of a population team's value there, the second term of Eq. (2)."""
+    value_awareness: float = 1.0
+    """How much the mutual information of a state counts by its value: 1 as in Eq. (5), 0 not at
+    all, so that every state has the weight 1."""
+    crossover_probability: float = 1.0
+    """Probability that two offspring exchange heads; else they are copies of their parents."""
+    injection_probability: float = 1.0
+    """Probability that the MARL team enters the population at the end of a generation."""
     mutation_probability: float = 0.9
     """Probability that a team that is not the elite mutates."""
     agent_mutation_probability: float = 0.5
@@ -124,6 +136,16 @@ class RaceConfig:
     mutation_draw: MutationDraw = "row"
     """Whether a mutation's kind (strong, reset or mild) is drawn once per action row of a picked
     head or once per weight."""
+    strong_share: float = 0.05
+    """Share of mutations that are strong, N(0, (strong-strength w)^2) for a weight w."""
+    reset_share: float = 0.05
+    """Share of mutations that draw a weight anew, from N(0, 1); the others are mild."""
+    strong_strength: float = 10.0
+    """Standard deviation of a strong mutation, in units of the weight."""
+    mild_strength: float = 0.1
+    """Standard deviation of a mild mutation, in units of the weight."""
+    largest_weight: float | None = 10.0
+    """What mutates is kept within it. None: no bound."""
     elite_copy: bool = True
     """A copy of the elite enters the next population and is open to mutation."""
     tournament_size: int = 3
@@ -203,6 +225,8 @@ class Config:
     task: str
     algo: Algo = "race"
     base: Base | None = None  # until presets are filled in
+    ablation: tuple[str, ...] = ()
+    """Names of what was taken away (`race.config.ablations`); the settings below say it too."""
     discrete: bool = False
     seed: int = 1
     env_steps: int = 1_000_000
@@ -248,6 +272,17 @@ _BEFORE: dict[str, Any] = {
     "elite_copy": False,
     "retries": 3,
     "step_seconds": None,
+    "vfm_marl_weight": 1.0,
+    "vfm_team_weight": 1.0,
+    "value_awareness": 1.0,
+    "crossover_probability": 1.0,
+    "injection_probability": 1.0,
+    "strong_share": 0.05,
+    "reset_share": 0.05,
+    "strong_strength": 10.0,
+    "mild_strength": 0.1,
+    "largest_weight": 10.0,
+    "ablation": (),
 }
 
 

@@ -109,16 +109,24 @@ def state_value_loss(
     return expectation(jnp.square(value - target), mask)
 
 
-def value_weights(value: Float[Array, "B"], mask: Mask = None) -> Float[Array, "B"]:
+def value_weights(
+    value: Float[Array, "B"], mask: Mask = None, awareness: Number = 1.0
+) -> Float[Array, "B"]:
     """The min-max normalised state values of Eq. (5), in [0, 1] where samples are real.
 
     Equal values, for which the paper's fraction is 0/0, all get weight 0.
+
+    Args:
+        value: of the states.
+        mask: of the samples.
+        awareness: 0 for weights that are all 1; between 0 and 1 they are mixed.
     """
     real = None if mask is None else mask > 0
     low = jnp.min(value, where=real, initial=jnp.inf)
     high = jnp.max(value, where=real, initial=-jnp.inf)
     spread = high - low
-    return (value - low) / jnp.where(spread > 0, spread, jnp.ones_like(spread))
+    weights = (value - low) / jnp.where(spread > 0, spread, jnp.ones_like(spread))
+    return (1.0 - awareness) + awareness * weights
 
 
 def value_aware_mi_loss(

@@ -51,3 +51,29 @@ def track(target: Any, online: Any, rate: Number) -> Any:
 def copy(params: Any) -> Any:
     """The same values in buffers of their own, so that both can be donated to a program."""
     return jax.tree.map(jnp.copy, params)
+
+
+@jax.custom_vjp
+def weigh_gradient(x: Any, weight: Number) -> Any:
+    """``x`` itself, whose gradient is multiplied by ``weight`` on its way back."""
+    return x
+
+
+def _forward(x: Any, weight: Number) -> tuple[Any, Number]:
+    return x, weight
+
+
+def _backward(weight: Number, gradient: Any) -> tuple[Any, None]:
+    return jax.tree.map(lambda g: g * weight, gradient), None
+
+
+weigh_gradient.defvjp(_forward, _backward)
+
+
+@jax.custom_vjp
+def graft(x: Any, same: Any) -> Any:
+    """``x``, whose gradient goes to ``same`` too, an equal array with other ancestors."""
+    return x
+
+
+graft.defvjp(lambda x, same: (x, None), lambda _, gradient: (gradient, gradient))

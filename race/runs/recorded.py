@@ -34,7 +34,8 @@ def settings(config: Config) -> dict[str, Any]:
     Groups of settings that the method has no use for have no say.
     """
     kept = dataclasses.asdict(config)
-    for name in ("seed", "env_steps", "checkpoint"):
+    # Ablations are names for settings that are there anyway.
+    for name in ("seed", "env_steps", "checkpoint", "ablation"):
         del kept[name]
     for name in ("processes", "retries", "step_seconds"):
         del kept["env"][name]

@@ -67,7 +67,10 @@ def advance(run: Run, state: RunState) -> RunState:
 
 def inject(run: Run, state: RunState) -> RunState:
     """Line 11: the MARL team enters the population; the generation is over and has its row."""
-    algorithm = run.algorithm.inject(state.algorithm)
+    key = jax.random.fold_in(
+        root_key(run.config.seed, Purpose.INJECTION), state.progress.generation
+    )
+    algorithm = run.algorithm.inject(state.algorithm, key, state.hyper)
     progress = stamped(run, state.progress.but(learning=False))
     row = generation_row(run.config, run.algorithm, algorithm, state.losses, progress)
     run.metrics.write(row)

@@ -1,6 +1,7 @@
 """Learning curves: which quantity of which runs, and what several seeds become."""
 
 import difflib
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from race.config.ablations import told_by_name
 from race.config.settings import Config
 from race.errors import RaceError
 from race.runs.recorded import Recorded, settings
@@ -98,22 +100,34 @@ def keys(metric: str, team: str, config: Config) -> dict[str, str]:
 
 
 def names_of(runs: Sequence[Recorded]) -> list[str]:
-    """Each run's method, with the settings in which runs of one method and task differ."""
+    """Each run's method and ablations, with the settings in which runs of one method differ.
+
+    What an ablation sets is told by its name.
+    """
 
     def all_of(run: Recorded) -> dict[str, Any]:
         return {**settings(run.config), "algorithm version": run.algorithm_version}
 
-    every = [all_of(run) for run in runs]
-    of_method: dict[tuple[str, str], list[dict[str, Any]]] = {}
-    for run, mine in zip(runs, every, strict=True):
-        of_method.setdefault((run.config.task, run.config.method), []).append(mine)
+    of_method: dict[tuple[str, str], list[tuple[dict[str, Any], set[str]]]] = {}
+    for run in runs:
+        of_method.setdefault((run.config.task, run.config.method), []).append(
+            (all_of(run), told_by_name(run.config))
+        )
     differing = {
-        key: [name for name in rivals[0] if any(r[name] != rivals[0][name] for r in rivals)]
+        key: [
+            name
+            for name in rivals[0][0]
+            if len({json.dumps(values[name]) for values, set_by in rivals if name not in set_by})
+            > 1
+        ]
         for key, rivals in of_method.items()
     }
     names = []
-    for run, mine in zip(runs, every, strict=True):
-        parts = [f"{key}={mine[key]}" for key in differing[run.config.task, run.config.method]]
+    for run in runs:
+        mine, told = all_of(run), told_by_name(run.config)
+        of_settings = differing[run.config.task, run.config.method]
+        parts = [f"{key}={mine[key]}" for key in of_settings if key not in told]
+        parts = [*run.config.ablation, *parts]
         names.append(" ".join([run.config.method, ", ".join(parts)]).strip())
     return names
 

@@ -50,6 +50,9 @@ class Case:
             self.config, learner=dataclasses.replace(self.config.learner, **learner)
         )
 
+    def inject(self, state: Any) -> Any:
+        return self.algorithm.inject(state, jax.random.key(0), hyper_of(self.config))
+
     def init(self, seed: int) -> Any:
         return self.algorithm.init(jax.random.key(seed), self.spec, shape_of(self.config))
 
@@ -107,7 +110,7 @@ def test_functions_keep_structure_shapes_and_types(case: Case) -> None:
     evolved = jax.eval_shape(
         partial(case.algorithm.evolve, **static), case.state, case.fitness, key
     )
-    injected = jax.eval_shape(case.algorithm.inject, case.state)
+    injected = jax.eval_shape(case.inject, case.state)
     for after in (updated, evolved, injected):
         assert jax.tree.structure(after) == jax.tree.structure(before)
         for a, b in zip(jax.tree.leaves(after), jax.tree.leaves(before), strict=True):
@@ -178,7 +181,7 @@ def test_a_step_traces_once(case: Case, batch_of: Callable[..., Any]) -> None:
             state, batch_of(case.spec, 3, step), jnp.int32(step), jax.random.key(step)
         )
         if case.algorithm is race and step % 2:
-            state = case.algorithm.inject(case.evolve(state, case.fitness, jax.random.key(step)))
+            state = case.inject(case.evolve(state, case.fitness, jax.random.key(step)))
         sizes.append(case.update._cache_size())
     assert sizes == sizes[:1] * 6
 
@@ -208,9 +211,9 @@ def test_seeds_are_a_leading_axis(case: Case, batch_of: Callable[..., Any]) -> N
     fitness = jnp.stack([case.fitness, case.fitness[::-1]])
     evolve = partial(case.algorithm.evolve, hyper=hyper_of(case.config), **case.static)
     evolved = jax.jit(jax.vmap(evolve))(stacked, fitness, keys)
-    evolved = jax.vmap(case.algorithm.inject)(evolved)
+    evolved = jax.vmap(case.inject)(evolved)
     for seed in range(2):
-        lone = case.algorithm.inject(case.evolve(states[seed], fitness[seed], keys[seed]))
+        lone = case.inject(case.evolve(states[seed], fitness[seed], keys[seed]))
         for a, b in zip(jax.tree.leaves(evolved), jax.tree.leaves(lone), strict=True):
             np.testing.assert_allclose(a[seed], b, rtol=1e-6)
 
@@ -291,7 +294,7 @@ def test_padded_columns_stay_zero(case: Case, batch_of: Callable[..., Any]) -> N
         state, *_ = case.update(
             state, batch_of(case.spec, 3, step), jnp.int32(step), jax.random.key(step)
         )
-        state = case.algorithm.inject(case.evolve(state, case.fitness, jax.random.key(step)))
+        state = case.inject(case.evolve(state, case.fitness, jax.random.key(step)))
     heads = np.asarray(case.algorithm.teams(state, case.spec).heads)
     padded = ~np.broadcast_to(np.asarray(case.spec.action_mask)[:, None], heads.shape)
     assert (heads[padded] == 0).all()
@@ -343,7 +346,7 @@ def test_the_next_population_is_elite_parent_copy_offspring_and_marl_team(
     evolve = compiled(race, "evolve", race_case.spec, dataclasses.replace(config, race=mutating))
     ranked = [3, 0, 2, 4, 1]  # all teams enter the tournament: the second is the parent
     fitness = jnp.zeros(5).at[jnp.array(ranked)].set(-jnp.arange(5.0))
-    after = race.inject(evolve(state, fitness, jax.random.key(2)))
+    after = race_case.inject(evolve(state, fitness, jax.random.key(2)))
     elite, parent, copy, offspring, marl = (np.asarray(after.heads[team]) for team in ranked)
     np.testing.assert_array_equal(elite, state.heads[3])
     np.testing.assert_array_equal(marl, state.policies.head.params)
@@ -364,7 +367,7 @@ def test_injection_replaces_the_worst_alone(race_case: Case) -> None:
     state = race_case.evolve(
         race_case.state, jnp.array([3.0, -1.0, 2.0, 5.0, 0.0]), jax.random.key(0)
     )
-    after = race.inject(state)
+    after = race_case.inject(state)
     for team in range(5):
         expected = state.policies.head.params if team == 1 else state.heads[team]
         assert_equal(after.heads[team], expected)
@@ -390,7 +393,7 @@ def test_fates_of_the_injected_team(race_case: Case) -> None:
             state, jnp.asarray(fitness), jax.random.key(place_of_injected or 0)
         )
         assert int(evolved.elite) == others[0]
-        return race.inject(evolved)
+        return race_case.inject(evolved)
 
     state = race_case.state
     assert int(state.injected) == -1

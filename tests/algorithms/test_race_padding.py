@@ -27,6 +27,7 @@ from tiny_episodes import (
 )
 
 from race.algorithms import race
+from race.config.hyper import hyper_of
 from race.config.settings import Config
 from race.replay.buffer import Layout, Replay, slots_of
 
@@ -163,9 +164,11 @@ def test_all_teams_act_with_a_head_for_every_agent(before: Any, config: Config) 
         assert jnp.array_equal(heads[-1, agent], before.policies.head.params[0])
 
 
-def test_injection_gives_every_agent_of_the_worst_team_the_marl_head(before: Any) -> None:
+def test_injection_gives_every_agent_of_the_worst_team_the_marl_head(
+    before: Any, config: Config
+) -> None:
     state = before._replace(worst=jnp.int32(2), elite=jnp.int32(0))
-    after = race.inject(state)
+    after = race.inject(state, jax.random.key(0), hyper_of(config))
     assert int(after.injected) == 2
     for agent in range(N):
         assert jnp.array_equal(after.heads[2, agent], before.policies.head.params[0])

@@ -213,6 +213,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     sizes = ("agents", "enemies", "actions", "obs", "state", "limit", "alpha", "beta")
     assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, 0.01, 1e-2]
     assert set(listing["algorithms"]) == {"race", "matd3", "maddpg", "facmac"}
+    assert "vmm-only" in listing["ablations"]
     race("list")
     table = capsys.readouterr().out
     assert "mamujoco/HumanoidStandup-9x8" in table
@@ -415,3 +416,21 @@ def test_a_config_of_another_program_is_refused(
     (run / "config.json").write_text('{"some": "thing"}')
     for command in ("resume", "evaluate", "render", "plot"):
         assert "config" in fails(f"{command} {run}", capsys)
+
+
+def test_ablations_are_named_recorded_and_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    made: list[Config] = []
+    monkeypatch.setattr("race.cli.training.run", lambda path, config: made.append(config))
+    race(f"train probe/target --ablation vmm-only no-injection {SMALL}")
+    (path,) = (tmp_path / "runs").iterdir()
+    assert path.name == "probe-target-race-matd3-vmm-only-no-injection-seed1"
+    assert run_directory.open_run(path) == made[0]
+    assert made[0].ablation == ("vmm-only", "no-injection")
+    error = fails("train probe/target --ablation vmm-only vfm-only", capsys)
+    assert "the encoders would learn from nothing" in error
+    error = fails("train probe/target --algo matd3 --ablation vmm-only", capsys)
+    assert "another method" in error
+    assert "--ablation" in fails("train probe/target --ablation vmm", capsys)
