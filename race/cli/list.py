@@ -59,7 +59,12 @@ def main(arguments: list[str]) -> None:
     console = streams.console()
     table = Table("task", "in the paper", "alpha", "beta", "what it is", title="Tasks")
     table.columns[0].no_wrap = True
+    group = None
     for info in tasks:
+        kind = info.id.partition("/")[0], info.paper_name is not None
+        if kind != group:  # of each kind the paper's tasks first, then the others
+            table.add_section()
+        group = kind
         alpha, beta = TABLES.get(info.id, ("", ""))
         table.add_row(info.id, info.paper_name or "", str(alpha), str(beta), info.description)
     console.print(table)
