@@ -163,8 +163,8 @@ class _Signals:
 
     def __enter__(self) -> "_Signals":
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(number) == signal.SIG_IGN:  # as under nohup
-                continue
+            if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
+                continue  # as under nohup
             self._previous[number] = signal.signal(number, self._pass_on)
         return self
 
