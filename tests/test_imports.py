@@ -15,7 +15,8 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     map(
         frozenset,
         (
-            {"", "errors", "compilation"},
+            {"", "errors"},
+            {"compilation"},
             {"config", "types"},
             {"method", "randomness"},
             {"networks", "replay", "runs", "envs", "statistics"},
