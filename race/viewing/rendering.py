@@ -29,7 +29,7 @@ PACKAGES = "apt-get install -y libegl1 libgl1-mesa-dri"
 SIZE = (480, 360)
 """Width and height of frames in pixels."""
 
-_MOST_FRAMES_PER_SECOND = 30
+_MOST_FRAMES_PER_SECOND = 30.0
 _PROBE = """
 import mujoco
 model = mujoco.MjModel.from_xml_string(
