@@ -276,9 +276,10 @@ def _whole(value: Any, field: str, task: str, least: int) -> int:
     except TypeError:
         number = least - 1
     if number < least:
+        meant = isinstance(value, float) and value.is_integer() and value >= least
         raise TaskError(
             f"Task {task}: {field} is {value!r}, but must be a whole number of at least {least}"
-            f"{f': write {value:.0f}' if isinstance(value, float) and value >= least else ''}."
+            f"{f': write {value:.0f}' if meant else ''}."
         )
     return number
 

@@ -24,6 +24,7 @@ SMALL = {
     "bench": "--only env/Hopper*",
     "plot": "",
     "archive": "",
+    "show": "",
     "list": "",
     "doctor": "",
 }

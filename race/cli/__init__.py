@@ -5,6 +5,7 @@ A command is added as a module with `main` and a line in `COMMANDS`; nothing bel
 
 import difflib
 import importlib
+import re
 import sys
 import time
 
@@ -20,6 +21,7 @@ COMMANDS = {
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",
     "plot": "draw learning curves of one or more runs",
+    "show": "show what a run is, without running any code of it",
     "archive": "put the results of many runs into one small file",
     "list": "show tasks, algorithms, ablations and presets",
     "bench": "measure speed and memory on this machine",
@@ -71,6 +73,9 @@ def _run(arguments: list[str] | None) -> None:
         print(f"race {__version__}")
         return
     command, *rest = arguments
+    if any(word == "" or re.fullmatch("--[^=]+=", word) for word in rest):
+        say(f"race {command}: an argument is empty. Is a variable of the shell not set?")
+        sys.exit(2)
     if command not in COMMANDS:
         near = difflib.get_close_matches(command, COMMANDS, n=1)
         hint = f" Did you mean `race {near[0]}`?" if near else ""

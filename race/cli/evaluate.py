@@ -1,5 +1,6 @@
 """``race evaluate``."""
 
+import contextlib
 import json
 import sys
 from dataclasses import dataclass
@@ -63,7 +64,8 @@ def main(arguments: list[str]) -> None:
     batches = [seeds[i : i + BATCH] for i in range(0, len(seeds), BATCH)]
     parts: list[Score] = []
     with (
-        rollouts_of(trained.config, trained.task) as rollouts,
+        contextlib.redirect_stdout(sys.stderr),  # what environments print is no result
+        rollouts_of(trained.config, trained.task, proven=True) as rollouts,
         Progress(console=streams.console(stderr=True), transient=True) as bar,
     ):
         playing = bar.add_task("playing", total=len(seeds))

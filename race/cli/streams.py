@@ -5,7 +5,7 @@ import contextlib
 import io
 import os
 import sys
-from typing import TYPE_CHECKING, Any, Final, TextIO, final
+from typing import TYPE_CHECKING, Any, Final, final
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,7 +50,7 @@ class Tolerant:
         failure: what went wrong first, if anything.
     """
 
-    def __init__(self, stream: io.TextIOBase) -> None:
+    def __init__(self, stream: Any) -> None:
         self._stream = stream
         self.failure: OSError | ValueError | None = None
 
@@ -79,7 +79,7 @@ class Tolerant:
         return getattr(self._stream, name)
 
 
-def silence(stream: io.TextIOBase | TextIO) -> None:
+def silence(stream: Any) -> None:
     """Sends what a stream still holds to nowhere, so that its end is no further error."""
     with contextlib.suppress(OSError, ValueError, AttributeError):
         nowhere = os.open(os.devnull, os.O_WRONLY)

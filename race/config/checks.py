@@ -1,10 +1,12 @@
 """What values of a configuration can work."""
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from race.config import numbers
 from race.config.settings import Config, EnvConfig, FacmacConfig, RaceConfig
 from race.errors import ConfigError
 
@@ -153,12 +155,26 @@ def check(config: Config) -> None:
             "0 or more",
         ),
         (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
+        *numbers.rules(config),
     ]
+    _refuse(rules)
+
+
+def _refuse(rules: Iterable[Rule]) -> None:
     for holds, name, value, must in rules:
         if isinstance(value, float) and not math.isfinite(value):
             raise ConfigError(f"--{name} is {value}, but it must be a finite number.")
         if not holds:
             raise ConfigError(f"--{name} is {value}, but it must be {must}.")
+
+
+def check_env(env: EnvConfig) -> None:
+    """Checks the settings of environments, before any is made.
+
+    Raises:
+        ConfigError: naming the first setting that cannot work, and what would.
+    """
+    _refuse(_env_rules(env))
 
 
 def _env_rules(env: EnvConfig) -> list[Rule]:

@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from race.config.checks import check_env
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
 from race.envs import discrete_probe, mamujoco, own, probe
@@ -106,7 +107,9 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
 
     Raises:
         TaskError: if there is no such task; the message names the nearest ones.
+        ConfigError: if a setting of environments cannot work.
     """
+    check_env(config)
     if task_id.startswith(_MICRO):
         return make_discrete_task(task_id)
     if own.is_own(task_id):

@@ -128,7 +128,8 @@ class CheckedEnv:
             raise RenderError(
                 f"The environment of {self._spec.task} drew no picture: render returned "
                 f"{contract.came(drawn)}, but must return an array [height, width, 3] of uint8. "
-                f"Let make('rgb_array') make an environment that does{self._place('render')}."
+                "Let make('rgb_array') make an environment that does"
+                f"{contract.place(self._env, 'render')}."
             )
         return np.ascontiguousarray(picture[..., :3])
 
@@ -162,16 +163,8 @@ class CheckedEnv:
         text = str(error)
         return HandedOverError(
             f"The environment of {self._spec.task} broke the contract {self._where()}: {text}"
-            f"{self._place(method)}."
+            f"{contract.place(self._env, method)}."
         )
-
-    def _place(self, method: str) -> str:
-        """Where the user wrote a method."""
-        written: Any = getattr(type(getattr(self._env, "unwrapped", self._env)), method, None)
-        code = getattr(inspect.unwrap(written), "__code__", None) if callable(written) else None
-        if code is None:
-            return ""
-        return f" ({written.__qualname__}: {code.co_filename}, line {code.co_firstlineno})"
 
 
 def takes(function: Any, *args: Any, **kwargs: Any) -> bool:

@@ -6,6 +6,7 @@ not plainly meant is refused with a `HandedOverError` whose text begins with wha
 """
 
 import functools
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple, final
 
@@ -113,7 +114,8 @@ def truth(value: Any, name: str) -> bool:
     one = _single(value)
     if one is None or one not in (0, 1):
         raise HandedOverError(
-            f"{name} is {came(value)}, but must be one True or False for the whole team"
+            f"{name} is {came(value)}, but must be one True or False for the whole team: the same "
+            "as all() or any() of the agents, where each has its own"
         )
     return bool(one)
 
@@ -241,6 +243,15 @@ def in_units(
     return np.where(low == -high, actions * high, shifted)
 
 
+def place(env: Any, method: str) -> str:
+    """Where the user wrote a method of an environment, in brackets; nothing if it is not known."""
+    written: Any = getattr(type(getattr(env, "unwrapped", env)), method, None)
+    code = getattr(inspect.unwrap(written), "__code__", None) if callable(written) else None
+    if code is None:
+        return ""
+    return f" ({written.__qualname__}: {code.co_filename}, line {code.co_firstlineno})"
+
+
 def came(value: Any) -> str:
     """What something is, in a few words."""
     if value is None:
@@ -278,7 +289,9 @@ def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[Any]:
         )
     if array.shape != shape:
         if array.shape[-len(shape) :] != shape or array.size != np.prod(shape):
-            raise HandedOverError(f"{name} has shape {array.shape}, but the task says {shape}")
+            raise HandedOverError(
+                f"{name} has shape {array.shape}, but the task says {shape}. Let the two agree"
+            )
         array = array.reshape(shape)
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 

@@ -9,8 +9,6 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-import mujoco
-
 Parts = Sequence[tuple[Any, ...]]
 """For each agent its joints, the library's nodes."""
 
@@ -56,6 +54,8 @@ def _merge_copies(parts: Parts, edges: Sequence[Any]) -> None:
 
 def _joint_of(node: Any, names: Counter[str], model: Any) -> int:
     """The joint of that name, if an actuator moves it; else the joint that the actuator moves."""
+    import mujoco  # not before a renderer has been chosen, which it looks for when it is imported
+
     named = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, node.label)
     moved = model.actuator_trnid[:, 0].tolist()
     return named if named in moved and names[node.label] == 1 else int(moved[node.act_ids])

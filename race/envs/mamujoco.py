@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from race.config.settings import EnvConfig
 from race.envs import joints
-from race.errors import ConfigError, TaskError
+from race.errors import ConfigError, TaskError, blamed
 from race.types import EnvSpec, Task
 
 # Partitions that gymnasium-robotics knows, for listing and suggestions. The many-segment robots
@@ -307,7 +307,8 @@ def _spec(
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Loads the library and keeps back what third parties say of it that is known as harmless."""
-    import mujoco
+    with blamed(TaskError, "mujoco cannot be imported, which Multi-Agent MuJoCo runs on"):
+        import mujoco
 
     def warn(message: str) -> None:
         # HalfCheetah's model file is gymnasium's; nobody here can mend it.

@@ -163,7 +163,7 @@ def factorised(
     return Task(spec, make, seeded)
 
 
-def _flat_box(space: Any, what: str, task: str) -> gymnasium.spaces.Box:
+def _flat_box(space: Any, what: str, task: Name) -> gymnasium.spaces.Box:
     if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
         return space
     raise TaskError(

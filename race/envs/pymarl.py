@@ -229,7 +229,7 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         if spec.has_wins:
             # SMAC does not tell after its game broke down and had to be started again.
             facts["battle_won"] = self._checked(
-                contract.truth, facts.get("battle_won", False), 'info["battle_won"]'
+                "step", contract.truth, facts.get("battle_won", False), 'info["battle_won"]'
             )
         facts["refused"] = refused
         return self._observe(), reward, terminated, truncated, facts
@@ -271,34 +271,35 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
                     "number for the team, a bool and a dictionary, or EPyMARL's five values; it "
                     f"returned {contract.came(answer)}."
                 )
-        worth = self._checked(contract.payment, reward)
-        over = self._checked(contract.truth, ended, "terminated")
-        truncated = self._checked(contract.truth, cut, "truncated")
+        worth = self._checked("step", contract.payment, reward)
+        over = self._checked("step", contract.truth, ended, "terminated")
+        truncated = self._checked("step", contract.truth, cut, "truncated")
         limit = facts.get("episode_limit", False)
-        limited = self._checked(contract.truth, limit, 'info["episode_limit"]')
+        limited = self._checked("step", contract.truth, limit, 'info["episode_limit"]')
         terminated = over and not limited
         return worth, terminated, (over or truncated) and not terminated, dict(facts)
 
     def _observe(self) -> dict[str, Any]:
-        spec, env, n = self.sizes, self._env, self.sizes.n_agents
-        obs, actions = (n, spec.obs_size), (n, spec.n_actions)
+        spec, n = self.sizes, self.sizes.n_agents
         seen = {
-            "obs": self._checked(contract.numbers, env.get_obs(), obs, "what get_obs returned"),
-            "state": self._checked(
-                contract.numbers, env.get_state(), (spec.state_size,), "what get_state returned"
-            ),
+            "obs": self._shown("get_obs", contract.numbers, (n, spec.obs_size)),
+            "state": self._shown("get_state", contract.numbers, (spec.state_size,)),
         }
-        available = self._checked(
-            contract.mask, env.get_avail_actions(), actions, "what get_avail_actions returned"
-        )
-        self._checked(contract.refuse_idle, available)
+        available = self._shown("get_avail_actions", contract.mask, (n, spec.n_actions))
+        self._checked("get_avail_actions", contract.refuse_idle, available)
         self._available = available.astype(np.int8)
         return seen | {"avail_actions": self._available.copy()}
 
-    def _checked(self, check: Callable[..., Any], *arguments: Any) -> Any:
+    def _shown(self, method: str, check: Callable[..., Any], shape: tuple[int, ...]) -> Any:
+        value = getattr(self._env, method)()
+        return self._checked(method, check, value, shape, f"what {method} returned")
+
+    def _checked(self, method: str, check: Callable[..., Any], *arguments: Any) -> Any:
+        """A check of what a method of the environment returned."""
         try:
             return check(*arguments)
         except HandedOverError as error:
             raise HandedOverError(
-                f"Task {self.sizes.task}, after {self._steps} steps: {error}."
+                f"Task {self.sizes.task}, after {self._steps} steps: {error}"
+                f"{contract.place(self._env, method)}."
             ) from error

@@ -6,6 +6,7 @@ process. Nothing here imports jax: a worker is up in the time that the user's mo
 
 import contextlib
 import multiprocessing
+import os
 import pickle
 import signal
 from multiprocessing.connection import Connection
@@ -96,9 +97,11 @@ class WorkerEnv:
             self._process.join(_CLOSING_SECONDS)
             code = self._process.exitcode
             how = f"was ended by signal {-code}" if code and code < 0 else f"exited with {code}"
+            script = 'A script of yours needs the usual `if __name__ == "__main__":`. '
             raise EnvFailedError(
                 f"The process of an environment of {self._name} {how} {self._where()}, without an "
-                "error message. Run it with --env.processes False to see what ends it."
+                f"error message. {script if waiting == 'made' else ''}Run it with --env.processes "
+                "False to see what ends it."
             ) from error
         self._waiting = ""
         if kind == "done":
@@ -147,6 +150,7 @@ class WorkerEnv:
 
 def _serve(pipe: Connection, pickled: bytes) -> None:
     """What the process does: answers, until its pipe is closed or it is told to end."""
+    os.dup2(2, 1)  # what an environment prints is no output of a command
     # Ctrl-C reaches every process of a terminal, and a hang-up too; the main one ends its workers.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

@@ -168,9 +168,13 @@ class EnvPool:
 
     def close(self) -> None:
         """Closes all environments and ends their processes; says what fails then."""
+        failures: list[TaskError] = []
         for envs in (self._here, self._workers):
             while envs:
-                _close(envs.popitem()[1])
+                failures += _close(envs.popitem()[1])
+        if failures:
+            more = f" So did {len(failures) - 1} more." if len(failures) > 1 else ""
+            say(f"{failures[0]}{more} What was done before is not affected.")
 
     def _make(self, teams: Mapping[int, int]) -> dict[int, Seen | EnvFailedError]:
         """Makes the missing environments of some teams; returns the errors."""
@@ -195,7 +199,7 @@ class EnvPool:
             raise error
         env = self._workers.pop(team, None) or self._here.pop(team, None)
         if env is not None:
-            _close(env, quietly=True)
+            _close(env)
         return error
 
     def __enter__(self) -> "EnvPool":
@@ -210,14 +214,14 @@ class EnvPool:
         self.close()
 
 
-def _close(env: CheckedEnv | WorkerEnv, *, quietly: bool = False) -> None:
+def _close(env: CheckedEnv | WorkerEnv) -> list[TaskError]:
     # An environment that cannot be closed must not hide what went wrong before, nor keep others
     # open, nor spoil a run that is complete.
     try:
         env.close()
     except TaskError as error:
-        if not quietly:
-            say(str(error))
+        return [error]
+    return []
 
 
 def _processes_pay(task: Task, size: int) -> bool:
@@ -249,5 +253,5 @@ def _seconds_per_step(task: Task) -> float:
             if step.terminated or step.truncated:
                 env.reset(0)
     finally:
-        _close(env, quietly=True)
+        _close(env)
     return float(np.median(seconds))

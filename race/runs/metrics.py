@@ -170,6 +170,9 @@ def read(path: Path, run: str | None = None, kept: Extent | None = None) -> list
 def _row(path: Path, number: int, line: bytes) -> dict[str, Any]:
     try:
         row = parse_object(line)
+        for name, value in row.items():
+            if type(value) is int and abs(value) > MOST_STEPS:
+                raise ValueError(f"its {name} are {str(value)[:40]}")
         steps = row.get("env_steps", 0)
         if row.get("kind") in ("generation", "evaluation"):
             # What every reader of rows takes for granted.

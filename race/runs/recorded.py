@@ -20,7 +20,8 @@ class Recorded(NamedTuple):
     @property
     def algorithm_version(self) -> int:
         """`race.ALGORITHM_VERSION` of the version that began it."""
-        return int(self.metadata.get("algorithm_version", 1))
+        told = self.metadata.get("algorithm_version", 1)
+        return told if type(told) is int else 1
 
     @property
     def experiment(self) -> str:

@@ -19,6 +19,7 @@ from race.errors import ConfigError, DivergenceError, TaskError, command
 from race.rollouts import rollouts_of
 from race.runs import checkpoints
 from race.runs import directory as run_directory
+from race.runs import metrics as metrics_file
 from race.runs.directory import RunDirectory
 from race.runs.metrics import MetricsWriter, set_aside
 from race.training.clock import Clock
@@ -64,7 +65,7 @@ def train(
     """
     began = time.perf_counter() if began is None else began
     # An environment may change the current directory.
-    path = path.absolute()
+    given, path = path, path.absolute()
     directory, algorithm = RunDirectory(path), algorithm_of(config)
     report("preparing the task", Progress(), {})
     task, origin = make_task(config.task, config.env), run_directory.read_metadata(path)
@@ -76,7 +77,9 @@ def train(
         if saved is not None:
             check_owner(saved, identity)
         made = Progress() if saved is None else progress_of(saved)
-        if not _must_go_on(path, config, extend, made):
+        kept = metrics_kept(saved)
+        if not _must_go_on(given, config, extend, made):
+            metrics_file.read(directory.metrics, identity, kept)
             run_directory.mark_finished(path)
             return made
         rollouts = rollouts_of(config, task, proven=made.env_steps > 0)
@@ -87,7 +90,6 @@ def train(
             # An empty buffer beside the full one would take as much memory again.
             shapes = jax.eval_shape(rollouts.empty_replay)
             state = from_checkpoint(saved, config, task.spec, algorithm, shapes)
-        kept = metrics_kept(saved)
         del saved  # its buffer too
         if without_metrics:
             kept = set_aside(directory.metrics, kept)

@@ -23,6 +23,8 @@ LABELS = {
     "champion": "champion",
     "best": "best of two tests",
 }
+LARGEST = 1e30
+"""Of what can be drawn: environments pay no more than 1e15 a step."""
 Axis = Literal["env_steps", "wall_time"]
 # Key of the rows, and how many of its units are one on the axis.
 _AXES: dict[Axis, tuple[str, float]] = {
@@ -161,7 +163,12 @@ def curve_of(run: Recorded, key: str, axis: Axis) -> Curve | None:
     if not points:
         return None
     x, values = np.array(points).T
-    made = max(float(row.get("env_steps", 0)) for row in run.rows)
+    if np.abs(values).max() > LARGEST:
+        raise RaceError(
+            f"A value of {key} in {run.name} is {values[np.abs(values).argmax()]:g}, which no run "
+            "gives: the rows were damaged or edited. Leave the run out, or put them right."
+        )
+    made = max(float(steps) for row in run.rows if _is_number(steps := row.get("env_steps", 0)))
     return Curve(x, values, made, run.config.seed, run.name)
 
 
@@ -189,4 +196,6 @@ def no_values(runs: Sequence[Recorded], metric: str) -> RaceError:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return isinstance(value, int) and not isinstance(value, bool)

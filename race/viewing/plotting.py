@@ -15,6 +15,7 @@ from race.runs.recorded import Recorded
 from race.runs.results import load
 from race.statistics.intervals import LEAST_SEEDS_OF_A_BAND, bounds_of
 from race.viewing import curves as chosen
+from race.viewing.aside import written_aside
 from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ended_early
 
 FORMATS = (".png", ".svg", ".pdf")
@@ -94,11 +95,8 @@ def plot(
     for index, (task, methods) in enumerate(sorted(panels.items())):
         axes = figure.add_subplot(rows, columns, index + 1)
         found += _panel(axes, task, methods, metric, axis, with_seeds=team != "all")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(out, dpi=150)
-    except OSError as error:
-        raise RaceError(f"{out} cannot be written: {error}.") from error
+    with written_aside(out) as temporary:
+        figure.savefig(temporary, dpi=150)
     return Drawn(found, without)
 
 

@@ -65,6 +65,7 @@ def choose_renderer() -> Renderer:
     asked = os.environ.get("MUJOCO_GL", "").lower()
     candidates = [b for b in get_args(Backend)[:-1] if b == asked] if asked else offered
     if not candidates:
+        os.environ["MUJOCO_GL"] = "disabled"  # with a word that it does not know, mujoco is none
         return Renderer("sketch", f"the built-in renderer, because MUJOCO_GL is {asked!r}")
     for candidate in candidates:
         if _draws(candidate):
@@ -212,7 +213,7 @@ def _step_seconds(env: Any) -> float:
     seconds = getattr(getattr(env, "unwrapped", env), "dt", None)
     if isinstance(seconds, float) and 0 < seconds < np.inf:
         return seconds
-    return 1 / frames_per_second(env, _MOST_FRAMES_PER_SECOND)
+    return 1 / frames_per_second(env, float(_MOST_FRAMES_PER_SECOND))
 
 
 def frames_per_second(env: Any, otherwise: float) -> float:
