@@ -1,6 +1,7 @@
 """An environment whose every answer has been checked, and whose errors are told as the user's."""
 
 import inspect
+import signal
 from typing import Any, Final, NoReturn, final
 
 import numpy as np
@@ -153,7 +154,7 @@ class CheckedEnv:
         return f"{what} of the episode of seed {self._seed} (environment {self._number})"
 
     def _failed(self, error: BaseException, where: str) -> NoReturn:
-        if isinstance(error, _PASSING):
+        if isinstance(error, _PASSING) and not _is_own_interrupt(error):
             raise error
         raise EnvFailedError(
             f"The environment of {self._spec.task} failed {where}: {described(error)}."
@@ -165,6 +166,12 @@ class CheckedEnv:
             f"The environment of {self._spec.task} broke the contract {self._where()}: {text}"
             f"{contract.place(self._env, method)}."
         )
+
+
+def _is_own_interrupt(error: BaseException) -> bool:
+    """Whether an environment itself raised `KeyboardInterrupt`, where Ctrl-C does not raise it."""
+    asks = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    return isinstance(error, KeyboardInterrupt) and not asks
 
 
 def takes(function: Any, *args: Any, **kwargs: Any) -> bool:

@@ -112,12 +112,14 @@ def truth(value: Any, name: str) -> bool:
     if isinstance(value, bool | np.bool_):
         return bool(value)
     one = _single(value)
-    if one is None or one not in (0, 1):
-        raise HandedOverError(
-            f"{name} is {came(value)}, but must be one True or False for the whole team: the same "
-            "as all() or any() of the agents, where each has its own"
-        )
-    return bool(one)
+    if one in (0, 1):
+        return bool(one)
+    advice = ": the same as all() or any() of the agents, where each has its own"
+    if one is not None or isinstance(value, str):
+        advice = ", and no number or text"
+    raise HandedOverError(
+        f"{name} is {came(value)}, but must be one True or False for the whole team{advice}"
+    )
 
 
 def payment(value: Any) -> float:

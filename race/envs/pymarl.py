@@ -55,7 +55,7 @@ def pymarl_task(make: Callable[[], Any], task: str, *, has_wins: bool = False) -
         spec = _spec(env, task, has_wins)
         seeded = _takes_seed(env)
     finally:
-        with contextlib.suppress(Exception):  # it would hide what was wrong before
+        with contextlib.suppress(Exception, SystemExit):  # it would hide what was wrong before
             env.close()
     made = functools.partial(_make, make, task, has_wins)
     return DiscreteTask(spec, made, seeded=seeded)
@@ -299,7 +299,8 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         try:
             return check(*arguments)
         except HandedOverError as error:
+            steps = f"{self._steps} step{'s' * (self._steps != 1)}"
             raise HandedOverError(
-                f"Task {self.sizes.task}, after {self._steps} steps: {error}"
+                f"Task {self.sizes.task}, after {steps}: {error}"
                 f"{contract.place(self._env, method)}."
             ) from error

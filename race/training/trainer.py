@@ -78,7 +78,8 @@ def train(
             check_owner(saved, identity)
         made = Progress() if saved is None else progress_of(saved)
         kept = metrics_kept(saved)
-        if not _must_go_on(given, config, extend, made):
+        without = ["--without-metrics"] if without_metrics else []
+        if not _must_go_on(given, config, extend, made, without):
             metrics_file.read(directory.metrics, identity, kept)
             run_directory.mark_finished(path)
             return made
@@ -134,7 +135,9 @@ def is_over(config: Config, progress: Progress) -> bool:
     return progress.env_steps >= config.env_steps and not progress.learning
 
 
-def _must_go_on(path: Path, config: Config, extend: bool, progress: Progress) -> bool:
+def _must_go_on(
+    path: Path, config: Config, extend: bool, progress: Progress, without: list[str]
+) -> bool:
     steps = f"The run in {path} has made {progress.env_steps:,} environment steps"
     if extend and config.env_steps <= progress.env_steps:
         raise ConfigError(
@@ -144,7 +147,7 @@ def _must_go_on(path: Path, config: Config, extend: bool, progress: Progress) ->
     if is_over(config, progress) and run_directory.is_finished(path):
         raise ConfigError(
             f"{steps} and has finished. To train it further, say up to how many steps: "
-            + command("race", "resume", path, "--env-steps", 2 * config.env_steps)
+            + command("race", "resume", path, "--env-steps", 2 * config.env_steps, *without)
         )
     return not is_over(config, progress)
 
@@ -177,7 +180,14 @@ def _advance(run: Run, state: RunState) -> RunState:
 
 def _train(run: Run, state: RunState) -> RunState:
     if state.progress.env_steps == 0:
-        state = warm_up(run, state)
+        try:
+            state = warm_up(run, state)
+        except TaskError as error:
+            begin = command("race", "resume", run.directory.path)
+            raise type(error)(
+                f"{error} Nothing had been learned yet; once that is mended, begin again with: "
+                f"{begin}"
+            ) from error
         if run.interrupts.requested:
             return state  # there is nothing yet that starting again would not bring back
         save(run, state)

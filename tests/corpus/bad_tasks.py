@@ -143,6 +143,7 @@ _STEPS: dict[str, Callable[[Any, list[Any]], Any]] = {
     "raises_stop": _raises(StopIteration()),
     "raises_assert": _raises(AssertionError("[/red] is no markup")),
     "raises_gym": _raises(gymnasium.error.ResetNeeded("x")),
+    "interrupts": _raises(KeyboardInterrupt()),
     "exits": _raises(SystemExit()),
     "exits_three": _raises(SystemExit(3)),
     "exits_text": _raises(SystemExit("bye")),

@@ -252,6 +252,7 @@ LATE = _cases(
     _TASK + " --learner.hidden-sizes 4 4 --learner.batch-size 4 --env.retries 0 --run-dir run",
     {
         "reset_late": "boom in reset",
+        "late_interrupts": ("KeyboardInterrupt, in", "bad_tasks.py, line"),
         "third_make": ("there are two licences only, in", "bad_tasks.py, line"),
         **{
             f"late_{name}": words
@@ -267,13 +268,14 @@ _GAME = "train bad_tasks:{} --algo facmac --env-steps 50"
 GAMES = _cases(
     _GAME,
     {
-        "g_done_agents": ("after 1 steps", "terminated is a list of 2"),
+        "g_done_agents": ("after 1 step:", "terminated is a list of 2"),
         "g_done_dict": "terminated is a dictionary ('agent_0')",
         "g_done_text": "terminated is str 'False'",
         "g_reward_agents": "the reward is a list of 2",
         "g_reward_text": "the reward is str '1.5'",
         "g_reward_nan": "the reward is nan",
-        "g_limit_number": 'info["episode_limit"] is int 6',
+        "g_limit_number": 'info["episode_limit"] is int 6, but must be one True or False for the '
+        "whole team, and no number",
         "g_limit_text": 'info["episode_limit"] is str',
         "g_two": "step must return (reward, terminated, info)",
         "g_four": "step must return (reward, terminated, info)",

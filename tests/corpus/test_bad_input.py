@@ -85,7 +85,8 @@ def _value(word: str) -> Any:
         return word
 
 
-def check(case: Case, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def check(case: Case, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> str:
+    """Runs a command and looks at its code and words, which it returns."""
     if not case.parsed:
         monkeypatch.setattr(train_command, "_parse", read_quickly)
     with pytest.raises(SystemExit) as stopped:
@@ -100,6 +101,7 @@ def check(case: Case, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.Mo
     if not case.parsed:
         assert said.err.startswith("race train: ")
         assert said.err.count("\n") == 1  # one paragraph
+    return message
 
 
 def not_refused(*_: Any, **__: Any) -> None:
@@ -144,7 +146,9 @@ def test_what_goes_wrong_in_a_run_is_told(
     # The first words say where the run is.
     monkeypatch.setattr("race.cli.training.TrainingDisplay", Silent)
     monkeypatch.setattr("race.cli.streams.Tolerant.write", lambda self, text: len(text))
-    check(case, capsys, monkeypatch)
+    message = check(case, capsys, monkeypatch)
+    if ":third_make" not in case.command:  # before there is anything to begin
+        assert "begin again with: race resume" in message
     assert not (place / "run" / "DONE").exists()
     assert not list((place / "run").glob("checkpoints/*"))
 

@@ -36,6 +36,7 @@ LINES: list[tuple[list[str], int, str]] = [
     (["plot", RUN, "--out", "p.svg"], 0, "Figure: p.svg"),
     (["archive", RUN, "--out", "a.jsonl.gz"], 0, "1 run of 1 experiment"),
     (["resume", RUN], 1, f"race resume '{RUN}' --env-steps 120"),
+    (["resume", RUN, "--without-metrics"], 1, "--env-steps 120 --without-metrics"),
     (["resume", RUN, "--env-steps", "80"], 0, "Finished after 80"),
     (["resume", RUN, "--env-steps", "99", "--without-metrics"], 1, "has no effect"),
     (["render", RUN], 1, "cannot be drawn"),

@@ -320,7 +320,7 @@ def test_steps_must_answer_as_pymarl_s_do(answer: Any) -> None:
 @pytest.mark.parametrize(
     ("answer", "told"),
     [
-        (([1.0, 1.0], False, {}), "after 1 steps: the reward is a list of 2"),
+        (([1.0, 1.0], False, {}), "after 1 step: the reward is a list of 2"),
         ((1.0, [False, True], {}), r"terminated is a list of 2 \(False, True\)"),
         ((1.0, {"agent_0": True}, {}), "terminated is a dictionary"),
         ((1.0, "False", {}), "terminated is str 'False'"),
