@@ -58,7 +58,8 @@ def main(arguments: list[str]) -> None:
         print(json.dumps(shown, indent=2))
         return
     console = streams.console()
-    steps = found.rows[-1].get("env_steps", 0) if found.rows else 0
+    told = found.rows[-1].get("env_steps") if found.rows else None
+    steps = told if type(told) is int else 0
     state = "finished" if shown["finished"] else "not finished"
     lines = [
         f"{config.method} on {config.task}, seed {config.seed}",
@@ -80,7 +81,12 @@ def main(arguments: list[str]) -> None:
         )
     lines += ["last rows:"] + [json.dumps(row) for row in shown["rows"]]
     for line in lines:
-        console.print(line, soft_wrap=True)
+        console.print(_plain(line), soft_wrap=True)
+
+
+def _plain(line: str) -> str:
+    """Without what would steer a terminal: the directory may be somebody else's."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in line)
 
 
 def _words(said: Any) -> list[str]:

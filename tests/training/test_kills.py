@@ -8,7 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ for line in sys.stdin:
     os.waitpid(child, 0)
     os.write(1, b"gone\\n")
 """
-STAGES = {"random steps", "rollouts", "learning", "evaluation", "saving"}
+STAGES = ("random steps", "rollouts", "learning", "evaluation", "saving")
 KILLS = {"race": 30, "matd3": 70}
 
 
@@ -81,20 +81,29 @@ def trainers(tmp_path: Path) -> Iterator["subprocess.Popen[str]"]:
         process.stdin.close()
 
 
+class Moment(NamedTuple):
+    """When to kill: so many seconds after a stage has been told of so many times."""
+
+    stage: str
+    times: int
+    seconds: float
+
+
 def trained(
-    process: "subprocess.Popen[str]", path: Path, kill_after: float | None
-) -> tuple[str, float]:
-    """Trains in a directory, and kills that after some seconds of training.
+    process: "subprocess.Popen[str]", path: Path, kill_at: Moment | None = None
+) -> tuple[str, list[str], float]:
+    """Trains in a directory, and kills that at some moment, if it comes to it.
 
     Returns:
-        The stage that it was in (``done``: it came to its end) and how long it trained.
+        The stage that it was in (``done``: it came to its end), all stages that it told of, and the
+        seconds from the first to the last of them.
     """
     stdin, stdout = process.stdin, process.stdout
     assert stdin is not None
     assert stdout is not None
     stdin.write(f"{path}\n")
     stdin.flush()
-    child, begun, stage = 0, 0.0, "starting"
+    child, due, told, begun = 0, float("inf"), [""], 0.0
     os.set_blocking(stdout.fileno(), False)
     try:
         for line in _lines(stdout):
@@ -103,15 +112,18 @@ def trained(
             if line.isdigit():
                 child = int(line)
             elif line:
-                # Preparing takes its time in every process; what may be lost comes after it.
-                begun = begun or time.monotonic() * (line not in ("preparing the task",))
-                stage = line
-            if kill_after is not None and begun and time.monotonic() - begun >= kill_after:
+                begun = begun or time.monotonic()
+                told.append(line)
+                if kill_at is not None and line == kill_at.stage:
+                    kill_at = kill_at._replace(times=kill_at.times - 1)
+                    if kill_at.times == 0:
+                        due = time.monotonic() + kill_at.seconds
+            if time.monotonic() >= due:
                 os.kill(child, signal.SIGKILL)
-                kill_after = None
+                due = float("inf")
     finally:
         os.set_blocking(stdout.fileno(), True)
-    return stage, time.monotonic() - begun if begun else 0.0
+    return told[-1], told, time.monotonic() - begun
 
 
 def _lines(stream: IO[str]) -> Iterator[str]:
@@ -137,18 +149,26 @@ def test_killed_runs_go_on_exactly(
     config = config_of(algo)
     for name in ("compiling", "whole"):
         run_directory.create(tmp_path / name, config)
-        stage, seconds = trained(trainers, tmp_path / name, None)
+        stage, told, seconds = trained(trainers, tmp_path / name)
         assert stage == "done"
     expected = rows(tmp_path / "whole")
     assert rows(tmp_path / "compiling") == expected
-    chance = np.random.default_rng(2023)
+    chance, usual = np.random.default_rng(2023), Counter(told)
     kills: Counter[str] = Counter()
     runs = 0
-    while kills.total() < KILLS[algo]:
+    while True:
         path = tmp_path / f"run{runs}"
         if not path.exists():
+            if kills.total() >= KILLS[algo]:
+                break
             run_directory.create(path, config)
-        stage, _ = trained(trainers, path, float(chance.uniform(0, 0.7 * seconds)))
+        moment = None
+        if kills.total() < KILLS[algo]:
+            # Each stage in turn; a run that is past it comes to its end, and the next one meets it.
+            aim = STAGES[kills.total() % len(STAGES)]
+            times = int(chance.integers(1, max(2, usual[aim] // 2)))
+            moment = Moment(aim, times, float(chance.uniform(0, 3 * seconds / len(told))))
+        stage, *_ = trained(trainers, path, moment)
         if stage == "done":
             assert (path / "DONE").exists()
             assert rows(path) == expected
@@ -156,7 +176,5 @@ def test_killed_runs_go_on_exactly(
         else:
             kills[stage] += 1
     print(f"{algo}: {kills.total()} kills ({dict(kills)}), {runs} whole runs, {seconds:.1f} s each")
-    stage, _ = trained(trainers, path, None) if not (path / "DONE").exists() else ("done", 0)
-    assert rows(path) == expected
-    assert runs > 3
-    assert set(kills) >= STAGES - ({"saving"} if algo == "race" else set()), kills
+    assert set(kills) >= set(STAGES), kills
+    assert runs >= KILLS[algo] // len(STAGES)
