@@ -213,7 +213,7 @@ def test_absurd_rows_are_refused_or_drawn(tmp_path: Path) -> None:
     rows = [json.loads(line) for line in lines]
     keys = sorted({key for row in rows for key in row} - {"kind"})
 
-    @settings(max_examples=25, deadline=None, suppress_health_check=list(HealthCheck))
+    @settings(max_examples=12, deadline=None, suppress_health_check=list(HealthCheck))
     @given(st.integers(0, len(rows) - 1), st.sampled_from(keys), ABSURD)
     def check(number: int, key: str, value: Any) -> None:
         new = [dict(row) for row in rows]
