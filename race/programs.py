@@ -117,6 +117,15 @@ def evolve(
     return algorithm.evolve(state, fitness, key, spec, shape, hyper)
 
 
+@partial(jax.jit, static_argnames=("algorithm", "shape"), donate_argnames="state")
+def inject(
+    state: Any, key: PRNGKeyArray, *, hyper: Hyper, algorithm: Algorithm, shape: Shape
+) -> Any:
+    """The MARL team enters the population."""
+    TRACES["inject"] += 1
+    return algorithm.inject(state, key, shape, hyper)
+
+
 @partial(jax.jit, donate_argnames="replay")
 def store(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
     """Writes the first ``count`` of some transitions or episodes."""
@@ -134,15 +143,21 @@ def act(
 ) -> Float[Array, "T U"]:
     """The joint actions of all teams, each in its own state: one batched call per tick."""
     TRACES["act"] += 1
-    learner = LEARNERS[base]
-    return act_teams(learner.encode(teams.encoder, state, spec), teams.heads, spec)
+    encode = LEARNERS[base].encode
+    if not teams.own_encoders:
+        return act_teams(encode(teams.encoder, state, spec), teams.heads, spec)
+    each = jax.vmap(lambda encoder, one: encode(encoder, one[None], spec)[:, 0])
+    z = each(teams.encoder, state)
+    return act_teams(jnp.moveaxis(z, 0, 1), teams.heads, spec)
 
 
 @partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
-def start(key: PRNGKeyArray, *, algorithm: Algorithm, spec: Spec, shape: Shape) -> Any:
+def start(
+    key: PRNGKeyArray, *, hyper: Hyper, algorithm: Algorithm, spec: Spec, shape: Shape
+) -> Any:
     """The state of an algorithm before its first step."""
     TRACES["start"] += 1
-    return algorithm.init(key, spec, shape)
+    return algorithm.init(key, spec, shape, hyper)
 
 
 @jax.jit

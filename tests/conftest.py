@@ -119,10 +119,12 @@ def tiny_config() -> Callable[..., Any]:
             mutation_fraction=0.5,
             tournament_size=10,
         )
+        if algo == "no-sharing":
+            algo, race = "race", {**(race or {}), "sharing": False}
         return resolve(
             Config(
                 task="tiny",
-                algo=algo if algo == "race" else base,  # type: ignore[arg-type]
+                algo=algo if algo in ("race", "merl", "ea") else base,  # type: ignore[arg-type]
                 base=base,  # type: ignore[arg-type]
                 learner=dataclasses.replace(learner_config, **(learner or {})),
                 facmac=FacmacConfig(mixer_size=3, hypernet_size=4),

@@ -16,7 +16,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         frozenset,
         (
             {"", "errors"},
-            {"compilation"},
+            {"compilation", "loading"},
             {"config", "types"},
             {"method", "randomness"},
             {"networks", "replay", "runs", "envs", "statistics"},

@@ -133,6 +133,10 @@ def test_every_setting_is_in_a_shape_or_a_hyper_or_known_to_be_the_hosts() -> No
         "replay_capacity",
         "replay_precision",
         "random_steps",
+        "random_steps_owed",
+        "marl_episodes",
+        "evolution_from",
+        "sharing",  # chooses the algorithm
         "gradient_steps_per_env_step",
         "gradient_steps_per_episode",
         "epsilon_start",
@@ -163,7 +167,7 @@ def test_what_a_learner_has_no_use_for_is_not_a_number_and_reaches_nothing(
 def one_step(config: Config, spec: EnvSpec) -> tuple[Any, Any]:
     """A state, and the compiled gradient step (with policies) whose numbers are an argument."""
     algorithm = algorithm_of(config)
-    state = algorithm.init(jax.random.key(3), spec, shape_of(config))
+    state = algorithm.init(jax.random.key(3), spec, shape_of(config), hyper_of(config))
 
     def update(state: Any, batch: Any, hyper: Hyper) -> Any:
         key, shape = jax.random.key(4), shape_of(config)
@@ -194,7 +198,7 @@ def test_evolution_with_numbers_as_arguments_gives_what_it_gives_with_constants(
 ) -> None:
     config = continuous("race", race=OTHER_RACE)
     algorithm, shape = algorithm_of(config), shape_of(config)
-    state = algorithm.init(jax.random.key(3), tiny_spec, shape)
+    state = algorithm.init(jax.random.key(3), tiny_spec, shape, hyper_of(config))
     fitness, key = jnp.arange(5.0), jax.random.key(6)
 
     def evolve(hyper: Hyper) -> Any:
@@ -213,7 +217,8 @@ def digest_of_a_step() -> str:
     from race.bench.update import random_replay
 
     fixed = statics(config, spec, algorithm_of(config))
-    state = programs.start(root_key(config.seed, Purpose.INIT), **fixed)
+    key = root_key(config.seed, Purpose.INIT)
+    state = programs.start(key, hyper=hyper_of(config), **fixed)
     after, _ = programs.learn(
         jax.tree.map(jnp.copy, state),
         programs.empty_losses(algorithm_of(config)),

@@ -69,11 +69,19 @@ def tiny_facmac(tiny_config: Callable[..., Config], layer_norm: bool = False) ->
 
 def start(config: Config) -> Any:
     """A fresh state of RACE, with targets and heads away from the online networks."""
-    state = jax.jit(partial(race.init, spec=SPEC, shape=shape_of(config)))(jax.random.key(11))
+    shape, hyper = shape_of(config), hyper_of(config)
+    state = jax.jit(partial(race.init, spec=SPEC, shape=shape, hyper=hyper))(jax.random.key(11))
     leaves, structure = jax.tree.flatten(state.target)
     rng = np.random.default_rng(28)
     moved = [x + jnp.asarray(0.3 * rng.normal(size=x.shape), jnp.float32) for x in leaves]
-    return state._replace(target=jax.tree.unflatten(structure, moved), heads=2.0 * state.heads)
+    target = jax.tree.unflatten(structure, moved)
+    return with_heads(state._replace(target=target), 2.0 * state.heads)
+
+
+def with_heads(state: Any, heads: Any) -> Any:
+    """The state with other teams in its population."""
+    teams = state.population.teams._replace(heads=heads)
+    return state._replace(population=state.population._replace(teams=teams))
 
 
 class Laid(NamedTuple):

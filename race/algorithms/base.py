@@ -3,53 +3,70 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from race.types import Spec
+from race.algorithms.population import Population
 
 Losses = dict[str, Float[Array, ""]]
 
 
-class Teams(NamedTuple):
-    """All acting teams: the population first, the MARL team last."""
+class Teams(eqx.Module):
+    """All acting teams: the population first, the MARL team last, where there are such."""
+
+    encoder: Any  # of all teams; or with a leading axis T, then one for each agent of each team
+    heads: Float[Array, "T N H1 A"]
+    own_encoders: bool = eqx.field(static=True, default=False)
+
+    @property
+    def count(self) -> int:
+        """T."""
+        return int(self.heads.shape[0])
+
+    def last_again(self, times: int) -> "Teams":
+        """The last team so many times instead of once."""
+        if times == 1:
+            return self
+        return self.at(np.r_[: self.count - 1, [self.count - 1] * times])
+
+    def at(self, places: Any) -> "Teams":
+        """The teams of some places."""
+        encoder = self.encoder
+        if self.own_encoders:
+            encoder = jax.tree.map(lambda leaf: leaf[places], encoder)
+        return Teams(encoder, self.heads[places], self.own_encoders)
+
+
+class Tested(NamedTuple):
+    """Teams that are tested, over the encoders that they share."""
 
     encoder: Any
-    heads: Float[Array, "T N H1 A"]
+    heads: dict[str, Float[Array, "N H1 A"]]  # by name: "marl", "champion"
 
 
 class Algorithm(NamedTuple):
     """Pure functions over one state pytree. ``spec`` and ``shape`` are static, ``hyper`` is not."""
 
     init: Callable[..., Any]
-    """(key, spec, shape) -> state."""
+    """(key, spec, shape, hyper) -> state."""
     teams: Callable[..., Teams]
-    """(state, spec) -> the teams that act."""
-    champion: Callable[[Any], Float[Array, "N H1 A"]]
-    """state -> heads of the team of best training fitness."""
+    """(state, spec, shape) -> the teams that act."""
+    tested: Callable[..., tuple[Tested, ...]]
+    """(state, spec) -> the MARL team (``marl``), if there is one, and the team of best training
+    fitness (``champion``), if there is a population."""
     evolve: Callable[..., Any]
     """(state, fitness [P], key, spec, shape, hyper) -> state; lines 9 of Algorithm 1."""
     update: Callable[..., tuple[Any, Losses, Losses]]
     """(state, batch, step, key, spec, shape, hyper) -> state, critic losses, policy losses; lines
     8, 10 and 13. Policy losses are zero on steps where the policy delay idles."""
     inject: Callable[..., Any]
-    """(state, key, hyper) -> state; line 11."""
-    injection_counts: Callable[[Any], Array | np.ndarray]
-    """state -> how often the injected team became elite, parent, discarded; shape [3]."""
+    """(state, key, shape, hyper) -> state; line 11."""
+    population: Callable[[Any], Population | None]
+    """state -> the population, if there is one."""
     critic_losses: tuple[str, ...]
     policy_losses: tuple[str, ...]
-
-
-def tested_teams(
-    algorithm: Algorithm, state: Any, spec: Spec, has_population: bool
-) -> tuple[Any, dict[str, Float[Array, "N H1 A"]]]:
-    """Encoders, and heads of the teams that are tested: ``marl`` and, if any, ``champion``."""
-    encoder, heads = algorithm.teams(state, spec)
-    tested = {"marl": heads[-1]}
-    if has_population:
-        tested["champion"] = algorithm.champion(state)
-    return encoder, tested
 
 
 def when(due: bool | Bool[Array, ""], step: Any, idle: Any, state: Any) -> Any:

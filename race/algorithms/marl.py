@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from race.algorithms.base import Algorithm, Losses, Teams, when
+from race.algorithms.base import Algorithm, Losses, Teams, Tested, when
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
@@ -32,13 +32,14 @@ class MarlState(NamedTuple):
     target: Targets
 
 
-def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> MarlState:
+def init(key: PRNGKeyArray, spec: Spec, shape: Shape, hyper: Hyper) -> MarlState:
     """A fresh learner whose targets equal its networks."""
     learner = learner_of(shape)
     encoder_key, head_key, critic_key = jax.random.split(key, 3)
     encoder = learner.init_encoder(encoder_key, spec, shape)
-    head = learner.init_head(head_key, spec, shape)
+    head = hyper.last_layer_scale * learner.init_head(head_key, spec, shape)
     critic = learner.init_critic(critic_key, spec, shape)
+    critic = learner.scale_output(critic, hyper.last_layer_scale)
     return MarlState(
         init_trainable(encoder),
         init_trainable(head),
@@ -86,9 +87,9 @@ def update(
         loss, (encoder_gradient, head_gradient) = jax.value_and_grad(policy_loss, argnums=(0, 1))(
             state.encoder.params, state.head.params
         )
-        rate, clip = hyper.actor_learning_rate, hyper.gradient_clip
-        encoder = descend(state.encoder, encoder_gradient, rate, clip)
-        head = descend(state.head, head_gradient, rate, clip)
+        clip = hyper.gradient_clip
+        encoder = descend(state.encoder, encoder_gradient, hyper.encoder_learning_rate, clip)
+        head = descend(state.head, head_gradient, hyper.actor_learning_rate, clip)
         online = Targets(encoder.params, head.params, state.critic.params)
         moved = learner.follow(state.target, online, step, shape, hyper)
         return MarlState(encoder, head, state.critic, moved), {"policy": loss}
@@ -100,15 +101,20 @@ def update(
     return state, {"critic": loss}, policy_losses
 
 
-def teams(state: MarlState, spec: Spec) -> Teams:
-    """The one team there is."""
+def heads_of(state: MarlState, n_agents: int) -> Float[Array, "N H1 A"]:
+    """The team with a head for every agent, also where its agents share one."""
     head = state.head.params
-    every = jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
-    return Teams(state.encoder.params, every[None])
+    return jnp.broadcast_to(head, (n_agents, *head.shape[1:]))
 
 
-def _champion(state: MarlState) -> Float[Array, "_ H1 A"]:
-    return state.head.params
+def teams(state: MarlState, spec: Spec, shape: Shape) -> Teams:
+    """The one team there is."""
+    return Teams(state.encoder.params, heads_of(state, spec.n_agents)[None])
+
+
+def tested(state: MarlState, spec: Spec) -> tuple[Tested, ...]:
+    """The one team there is."""
+    return (Tested(state.encoder.params, {"marl": heads_of(state, spec.n_agents)}),)
 
 
 def _evolve(
@@ -122,22 +128,22 @@ def _evolve(
     return state
 
 
-def _inject(state: MarlState, key: PRNGKeyArray, hyper: Hyper) -> MarlState:
+def _inject(state: MarlState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> MarlState:
     return state
 
 
-def _injection_counts(state: MarlState) -> Int[Array, "3"]:
-    return jnp.zeros(3, jnp.int32)
+def _population(state: MarlState) -> None:
+    return None
 
 
 marl = Algorithm(
     init=init,
     teams=teams,
-    champion=_champion,
+    tested=tested,
     evolve=_evolve,
     update=update,
     inject=_inject,
-    injection_counts=_injection_counts,
+    population=_population,
     critic_losses=("critic",),
     policy_losses=("policy",),
 )

@@ -15,52 +15,25 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from race.algorithms.base import Algorithm, Losses, Teams, when
+from race.algorithms.base import Algorithm, Losses, Teams, Tested, when
+from race.algorithms.evolutions import evolve as evolve_population
+from race.algorithms.evolutions import start as start_population
+from race.algorithms.population import Population, inject_team
+from race.algorithms.race_update import (
+    CRITIC_LOSSES,
+    POLICY_LOSSES,
+    Critics,
+    Policies,
+    Targets,
+    draw_teams,
+    train_critics,
+    train_policies,
+)
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
-from race.learners.base import Samples
-from race.method.crossover import breed, inject
-from race.method.equations import (
-    best_target,
-    encoder_loss,
-    marl_policy_loss,
-    mutual_information_bound,
-    state_value_loss,
-    td_loss,
-    value_aware_mi_loss,
-    value_function_maximization_loss,
-    value_weights,
-)
-from race.method.mutation import mutate_population
-from race.method.selection import select
-from race.networks.optimization import copy, descend, graft, init_trainable, weigh_gradient
+from race.networks.optimization import copy, init_trainable
 from race.types import Spec, Team
-
-
-class Targets(NamedTuple):
-    """Target networks, marked by a prime in the paper. Population teams have none."""
-
-    encoder: Any
-    head: Float[Array, "_ H1 A"]
-    critic: Any
-    pevfa: Any
-
-
-class Critics(NamedTuple):
-    """What line 8 trains, or its gradients."""
-
-    critic: Any  # Q_psi
-    pevfa: Any  # Q_theta
-    value: Any  # V_zeta
-
-
-class Policies(NamedTuple):
-    """What lines 10 and 13 train, or its gradients."""
-
-    encoder: Any  # Z_phi
-    head: Any  # W_marl
-    mine: Any  # T_omega
 
 
 class RaceState(NamedTuple):
@@ -69,21 +42,26 @@ class RaceState(NamedTuple):
     policies: Policies  # of Trainable
     critics: Critics  # of Trainable
     target: Targets
-    heads: Float[Array, "P N H1 A"]  # the population
-    elite: Int[Array, ""]
-    worst: Int[Array, ""]
-    injected: Int[Array, ""]  # where the MARL team was put last, -1 before the first time
-    injection_counts: Int[Array, "3"]  # elite, parent, discarded
+    population: Population  # of heads
+
+    @property
+    def heads(self) -> Float[Array, "P N H1 A"]:
+        """The teams of the population."""
+        heads: Array = self.population.teams.heads
+        return heads
 
 
-def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> RaceState:
+def init(key: PRNGKeyArray, spec: Spec, shape: Shape, hyper: Hyper) -> RaceState:
     """Line 1."""
     learner = learner_of(shape)
     keys = jax.random.split(key, 7)
+    scale = hyper.last_layer_scale
     encoder = learner.init_encoder(keys[0], spec, shape)
-    head = learner.init_head(keys[1], spec, shape)
-    critic = learner.init_critic(keys[2], spec, shape)
-    pevfa = learner.init_pevfa(keys[3], spec, shape)
+    head = scale * learner.init_head(keys[1], spec, shape)
+    critic = None
+    if not shape.one_pevfa:
+        critic = learner.scale_output(learner.init_critic(keys[2], spec, shape), scale)
+    pevfa = learner.scale_output(learner.init_pevfa(keys[3], spec, shape), scale)
     value = learner.init_value(keys[4], spec, shape)
     mine = learner.init_mine(keys[5], spec, shape)
     # Vmapped, since a program of hundreds of teams one after the other takes minutes to compile.
@@ -92,24 +70,23 @@ def init(key: PRNGKeyArray, spec: Spec, shape: Shape) -> RaceState:
     )
     return RaceState(
         policies=Policies(*map(init_trainable, (encoder, head, mine))),
-        critics=Critics(*map(init_trainable, (critic, pevfa, value))),
+        critics=Critics(
+            None if shape.one_pevfa else init_trainable(critic),
+            init_trainable(pevfa),
+            init_trainable(value),
+        ),
         target=copy(Targets(encoder, head, critic, pevfa)),
-        heads=heads,
-        elite=jnp.zeros((), jnp.int32),
-        worst=jnp.zeros((), jnp.int32),
-        injected=jnp.full((), -1, jnp.int32),
-        injection_counts=jnp.zeros(3, jnp.int32),
+        population=start_population(Team(None, heads), spec, shape),
     )
 
 
-def teams(state: RaceState, spec: Spec) -> Teams:
+def teams(state: RaceState, spec: Spec, shape: Shape) -> Teams:
     """The population and, last, the MARL team, all over the same encoders."""
     heads = jnp.concatenate([state.heads, _marl_team(state)[None]])
     return Teams(state.policies.encoder.params, heads)
 
 
 def _marl_team(state: RaceState) -> Float[Array, "N H1 A"]:
-    """The MARL team with a head for every agent, also where its agents share one."""
     return jnp.broadcast_to(state.policies.head.params, state.heads.shape[1:])
 
 
@@ -121,32 +98,9 @@ def evolve(
     shape: Shape,
     hyper: Hyper,
 ) -> RaceState:
-    """Line 9: selection, agent-level crossover and mutation; and what became of the injected."""
-    select_key, breed_key, mutate_key = jax.random.split(key, 3)
-    mask = jnp.asarray(spec.action_mask)
-    chosen = select(fitness, shape.tournament_size, select_key, spec.n_agents)
-    bred = breed(
-        Team(None, state.heads),
-        chosen,
-        mask,
-        hyper.crossover_probability,
-        breed_key,
-        shape.elite_copy,
-        "agent",
-    )
-    teams, _ = mutate_population(
-        bred.teams, chosen.elite, mask, hyper, mutate_key, shape.mutation_draw, "agent"
-    )
-    is_elite = state.injected == chosen.elite
-    is_parent = state.injected == chosen.parent[0]
-    is_discarded = (state.injected >= 0) & ~is_elite & ~is_parent
-    fate = jnp.stack([is_elite, is_parent, is_discarded]).astype(jnp.int32)
-    return state._replace(
-        heads=teams.heads,
-        elite=chosen.elite.astype(jnp.int32),
-        worst=chosen.worst.astype(jnp.int32),
-        injection_counts=state.injection_counts + fate,
-    )
+    """Line 9."""
+    evolved = evolve_population(state.population, fitness, key, spec, shape, hyper)
+    return state._replace(population=evolved)
 
 
 def update(
@@ -161,170 +115,64 @@ def update(
     """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
     learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
-    team = state.heads[jax.random.randint(team_key, (), 0, shape.population_size)]
+    head = state.policies.head.params
+    team, climbing = draw_teams(state.heads, head, team_key, spec, shape)
     samples = learner.now(batch, spec)
-    state, critic_losses, value = _train_critics(
-        state, batch, samples, team, critic_key, spec, shape, hyper
+    critics, critic_losses, value = train_critics(
+        state.critics, state.target, head, batch, samples, team, critic_key, spec, shape, hyper
     )
 
-    def policy_step(state: RaceState) -> tuple[RaceState, Losses]:
-        return _train_policies(state, samples, team, value, step, policy_key, spec, shape, hyper)
-
-    def idle(state: RaceState) -> tuple[RaceState, Losses]:
-        return state, {name: jnp.zeros(()) for name in POLICY_LOSSES}
-
-    state, policy_losses = when(learner.policy_due(step, shape), policy_step, idle, state)
-    return state, critic_losses, policy_losses
-
-
-def _train_critics(
-    state: RaceState,
-    batch: Any,
-    samples: Samples,
-    team: Float[Array, "N H1 A"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> tuple[RaceState, Losses, Float[Array, "B"]]:
-    """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch."""
-    learner, target = learner_of(shape), state.target
-    now, taken, mask = samples
-    later = learner.later(batch, spec)
-    marl_key, team_key = jax.random.split(key)
-
-    # One pass of the target encoders serves both teams. Eq. (1) gives a prime to the MARL team's
-    # policies alone; W_j has no slowly moving copy, but the encoder below it has.
-    z = learner.encode(target.encoder, later, spec)
-    marl_action = learner.target_action(z, target.head, later, marl_key, spec, hyper)
-    team_action = learner.target_action(z, team, later, team_key, spec, hyper)
-    marl_next = learner.q_marl(target.critic, later, marl_action, spec)
-    team_next = learner.q_team(target.pevfa, later, team_action, team, spec)
-    y_marl, y_team = (
-        learner.td_target(batch, learner.pessimistic(q), hyper) for q in (marl_next, team_next)
-    )
-    best = best_target(y_marl, y_team)
-
-    def loss(critics: Critics) -> tuple[Float[Array, ""], tuple[Losses, Float[Array, "B"]]]:
-        value = learner.state_values(critics.value, now)
-        losses = {
-            "critic": td_loss(learner.q_marl(critics.critic, now, taken, spec), y_marl, mask),
-            "pevfa": td_loss(learner.q_team(critics.pevfa, now, taken, team, spec), y_team, mask),
-            "value": state_value_loss(value, best, mask),
-        }
-        # The three share no parameter: the gradient of the sum is each one's own.
-        return losses["critic"] + losses["pevfa"] + losses["value"], (losses, value)
-
-    params = Critics(*(trained.params for trained in state.critics))
-    gradient, (losses, value) = jax.grad(loss, has_aux=True)(params)
-    critics = Critics(
-        *(
-            descend(trained, g, hyper.critic_learning_rate, hyper.gradient_clip)
-            for trained, g in zip(state.critics, gradient, strict=True)
+    def policy_step(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:
+        policies, target = moving
+        return train_policies(
+            policies,
+            critics,
+            target,
+            samples,
+            climbing,
+            value,
+            step,
+            policy_key,
+            spec,
+            shape,
+            hyper,
         )
+
+    def idle(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:
+        return *moving, {name: jnp.zeros(()) for name in POLICY_LOSSES}
+
+    # The population stays outside: what goes through a branch may be copied at each step.
+    policies, target, policy_losses = when(
+        learner.policy_due(step, shape), policy_step, idle, (state.policies, state.target)
     )
-    return state._replace(critics=critics), losses, value
+    moved = state._replace(policies=policies, critics=critics, target=target)
+    return moved, critic_losses, policy_losses
 
 
-def _train_policies(
-    state: RaceState,
-    samples: Samples,
-    team: Float[Array, "N H1 A"],
-    value: Float[Array, "B"],
-    step: Int[Array, ""],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> tuple[RaceState, Losses]:
-    """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE."""
-    learner = learner_of(shape)
-    now, _, mask = samples
-    marl_key, team_key, pairs_key = jax.random.split(key, 3)
-    critic = learner.first_critic(state.critics.critic.params)
-    pevfa = learner.first_pevfa(state.critics.pevfa.params)
-    weights = value_weights(value, mask, hyper.value_awareness)
-
-    def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
-        z = learner.encode(policies.encoder, now, spec)
-        # The weights of Eq. (2)'s terms are of what goes on into the encoders: W_marl learns by
-        # Eq. (7) whatever they are. They multiply gradients of actions, the smallest arrays there
-        # are.
-        fixed_z, fixed_head = jax.lax.stop_gradient((z, policies.head))
-        of_encoder = learner.act(z, fixed_head, now, marl_key, spec)
-        marl_action = graft(
-            learner.act(fixed_z, policies.head, now, marl_key, spec),
-            weigh_gradient(of_encoder, hyper.vfm_marl_weight),
-        )
-        team_action = learner.act(z, team, now, team_key, spec)
-        team_action = weigh_gradient(team_action, hyper.vfm_team_weight)
-        q_marl = learner.q_marl(critic, now, marl_action, spec)[0]
-        q_team = learner.q_team(pevfa, now, team_action, team, spec)[0]
-        # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
-        # held fixed. Both are the same numbers and are computed once.
-        fixed_mine = jax.lax.stop_gradient(policies.mine)
-        signal = learner.mutual_information(fixed_mine, now, z, pairs_key)
-        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key)
-        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None))(weights, signal, mask)
-        bound = jax.vmap(mutual_information_bound, in_axes=(0, None))(plain, mask)
-        vfm = value_function_maximization_loss(q_marl, q_team, mask)
-        # Encoders and MINEs, of which there are equally many, share no parameter among themselves:
-        # sums train each on its own terms.
-        # W_marl enters through q_marl alone: its gradient is that of Eq. (7).
-        total = encoder_loss(vfm, jnp.sum(vmm), hyper.vmm_weight) - jnp.sum(bound)
-        losses = {
-            "policy": marl_policy_loss(q_marl, mask),
-            "vfm": vfm,
-            "vmm": jnp.mean(vmm),
-            "mine": -jnp.mean(bound),
-        }
-        return total, losses
-
-    params = Policies(*(trained.params for trained in state.policies))
-    gradient, losses = jax.grad(loss, has_aux=True)(params)
-    rates = Policies(
-        hyper.actor_learning_rate, hyper.actor_learning_rate, hyper.critic_learning_rate
-    )
-    policies = Policies(*map(descend, state.policies, gradient, rates, [hyper.gradient_clip] * 3))
-    online = Targets(
-        policies.encoder.params,
-        policies.head.params,
-        state.critics.critic.params,
-        state.critics.pevfa.params,
-    )
-    target = learner.follow(state.target, online, step, shape, hyper)
-    return state._replace(policies=policies, target=target), losses
+def inject_marl(state: RaceState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> RaceState:
+    """Line 11."""
+    team = Team(None, _marl_team(state))
+    return state._replace(population=inject_team(state.population, team, key, hyper))
 
 
-def inject_marl(state: RaceState, key: PRNGKeyArray, hyper: Hyper) -> RaceState:
-    """Line 11: the MARL team replaces the team of lowest fitness (never the elite)."""
-    happens = jax.random.uniform(key) < hyper.injection_probability
-    teams = inject(Team(None, state.heads), Team(None, _marl_team(state)), state.worst)
-    return state._replace(
-        heads=jnp.where(happens, teams.heads, state.heads),
-        injected=jnp.where(happens, state.worst, -1),
-    )
+def tested(state: RaceState, spec: Spec) -> tuple[Tested, ...]:
+    """The MARL team and the champion, over the same encoders."""
+    heads = {"marl": _marl_team(state), "champion": state.population.champion.heads}
+    return (Tested(state.policies.encoder.params, heads),)
 
 
-def _champion(state: RaceState) -> Float[Array, "N H1 A"]:
-    return state.heads[state.elite]
+def _population(state: RaceState) -> Population:
+    return state.population
 
-
-def _injection_counts(state: RaceState) -> Int[Array, "3"]:
-    return state.injection_counts
-
-
-CRITIC_LOSSES = ("critic", "pevfa", "value")
-POLICY_LOSSES = ("policy", "vfm", "vmm", "mine")
 
 race = Algorithm(
     init=init,
     teams=teams,
-    champion=_champion,
+    tested=tested,
     evolve=evolve,
     update=update,
     inject=inject_marl,
-    injection_counts=_injection_counts,
+    population=_population,
     critic_losses=CRITIC_LOSSES,
     policy_losses=POLICY_LOSSES,
 )

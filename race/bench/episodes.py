@@ -88,7 +88,7 @@ class EpisodeUpdates:
         self._layout = layouts(places, episodes.length[places], spec.episode_limit)
         data = Episode(*map(jnp.asarray, episodes))
         self.replay = Replay(data, jnp.asarray(len(episodes.length), jnp.int32))
-        fresh = programs.start(jax.random.key(0), **self._statics)
+        fresh = programs.start(jax.random.key(0), hyper=self._hyper, **self._statics)
         self._state = jax.tree.map(jnp.copy, fresh)
         self._sums = programs.empty_losses(algorithm)
 

@@ -63,7 +63,7 @@ class Updates:
         self.replay = random_replay(self.spec, transitions)
         self._statics = {"algorithm": self.algorithm, "spec": self.spec, "shape": shape_of(config)}
         self._hyper = hyper_of(config)
-        self.state = programs.start(jax.random.key(0), **self._statics)
+        self.state = programs.start(jax.random.key(0), hyper=self._hyper, **self._statics)
         self._sums = programs.empty_losses(self.algorithm)
 
     def __call__(self, steps: int) -> Any:

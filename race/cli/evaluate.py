@@ -71,7 +71,7 @@ def main(arguments: list[str]) -> None:
         playing = bar.add_task("playing", total=len(seeds))
         for batch in batches:
             heads = {name: trained.heads[name]}
-            parts.append(rollouts.test(trained.encoder, heads, batch)[name])
+            parts.append(rollouts.test(trained.encoders[name], heads, batch)[name])
             bar.advance(playing, len(batch))
     wins = [part.won for part in parts if part.won is not None]
     score = Score(

@@ -9,11 +9,14 @@ import tyro
 
 from race.config.ablations import ABLATIONS
 from race.config.presets import PRESETS, TABLES
-from race.config.settings import Algo
+from race.config.settings import EVOLUTIONS, Algo
 
 ALGORITHMS = {
     "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "
     "maddpg, facmac)",
+    "merl": "MERL: a MARL team and an evolving population of whole networks beside it (--base as "
+    "for race)",
+    "ea": "EA: an evolving population of whole networks, no gradients",
     "matd3": "MATD3: twin central critics, delayed policies, target smoothing",
     "maddpg": "MADDPG: one central critic",
     "facmac": "FACMAC: the agents' utilities, mixed; for discrete actions too, recurrent there",
@@ -77,6 +80,10 @@ def main(arguments: list[str]) -> None:
     for name, ablation in ABLATIONS.items():
         ablations.add_row(name, ablation.description)
     console.print(ablations)
+    console.print(
+        f"--race.evolution: {', '.join(EVOLUTIONS)}, or your own: package.module:function, see "
+        "docs/evolution.md\n"
+    )
     presets = Table("--preset", "settings", title="Presets of the learner")
     for name, preset in PRESETS.items():
         presets.add_row(

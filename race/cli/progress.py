@@ -72,7 +72,7 @@ class TrainingDisplay:
             parts += [f"{self._rate:.0f} steps/s", f"{duration(left)} left"]
         if progress.fitness:
             parts.append(f"population best {rounded(max(progress.fitness))}")
-        if progress.generation:
+        if progress.generation and progress.marl_return is not None:
             parts.append(f"MARL team {rounded(progress.marl_return)}")
         return " · ".join(parts)
 
@@ -86,11 +86,12 @@ class TrainingDisplay:
 def _covered(progress: Progress, config: Config) -> float:
     """Environment steps, those of the current generation counted as its gradient steps go."""
     made = progress.env_steps - progress.env_steps_before
-    if not progress.learning:
+    if not progress.learning or not config.has_marl:
         return float(progress.env_steps)
     learned = progress.gradient_steps - progress.gradient_steps_before
     if config.discrete:
-        due = config.n_teams * config.facmac.gradient_steps_per_episode
+        episodes = len(progress.fitness) + config.n_marl_teams
+        due = episodes * config.facmac.gradient_steps_per_episode
     else:
         due = made * config.learner.gradient_steps_per_env_step
     return progress.env_steps_before + made * min(learned / max(due, 1.0), 1.0)

@@ -180,12 +180,12 @@ def _battle_of_run(chosen: Render, trained: Any, seconds: float, out: Path, cons
     from race.envs.micro.recording import replay
     from race.rollouts.discrete import EpisodeRollouts
 
-    head = trained.heads[trained.resolve(chosen.team or "selected")]
+    name = trained.resolve(chosen.team or "selected")
     with (
         console.status("playing the episode"),
         EpisodeRollouts(trained.config, trained.task) as rollouts,
     ):
-        actions = rollouts.episode(trained.encoder, head, chosen.seed)
+        actions = rollouts.episode(trained.encoders[name], trained.heads[name], chosen.seed)
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     with console.status("playing it again"):

@@ -40,9 +40,9 @@ class Train:
     """The task, such as mamujoco/HalfCheetah-2x3 or micro/2s3z (`race list` shows all), or
     package.module:function for your own."""
     algo: Algo = "race"
-    """race, or one of its baselines without a population."""
+    """race, or a baseline: with a population of whole networks (merl, ea) or without one."""
     base: Base | None = None
-    """The gradient learner inside race. None: matd3, on tasks with discrete actions facmac."""
+    """The gradient learner inside race and merl. None: matd3, on discrete actions facmac."""
     ablation: tuple[AblationName, ...] = ()
     """What to take away from race: one or several of `race list`. Each is a few settings."""
     seed: int = 1
@@ -80,6 +80,7 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
+    from race.algorithms.evolutions import evolution_of
     from race.cli.seeds import SHARED_ACCELERATOR, run_all
     from race.cli.training import run
     from race.compilation import use_cache
@@ -92,8 +93,10 @@ def main(arguments: list[str]) -> None:
     use_cache()
     task = make_task(asked.task, asked.env)
     discrete = isinstance(task, DiscreteTask)
+    asked = ablated(asked, chosen.ablation, discrete)
     _refuse_without_effect(asked, chosen.preset, task)
-    config = resolve(ablated(asked, chosen.ablation), discrete=discrete)
+    config = resolve(asked, discrete=discrete)
+    evolution_of(config.race.evolution)  # an operator that is not there is told of at once
     if chosen.seeds is None:
         if chosen.jobs is not None:
             raise ConfigError("--jobs has no effect without --seeds. Leave it out.")

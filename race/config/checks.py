@@ -7,7 +7,14 @@ from typing import Any
 import numpy as np
 
 from race.config import numbers
-from race.config.settings import Config, EnvConfig, FacmacConfig, RaceConfig
+from race.config.settings import (
+    EVOLUTIONS,
+    Config,
+    EnvConfig,
+    FacmacConfig,
+    LearnerConfig,
+    RaceConfig,
+)
 from race.errors import ConfigError
 
 LARGEST_LAYER = 16_384
@@ -29,6 +36,8 @@ def check(config: Config) -> None:
         ConfigError: naming the first setting that cannot work, and what would.
     """
     learner, race, facmac = config.learner, config.race, config.facmac
+    fewest = 3 + race.elite_copy + config.has_marl
+    assert race.vmm_weight is not None
     assert config.evaluation.every is not None
     assert config.evaluation.episodes is not None
     if config.discrete and config.base != "facmac":
@@ -39,7 +48,7 @@ def check(config: Config) -> None:
     rules: list[Rule] = [
         (1 <= config.env_steps < 2**31, "env-steps", config.env_steps, "from 1 to 2147483647"),
         (
-            config.discrete or config.env_steps > learner.random_steps,
+            config.discrete or not config.has_marl or config.env_steps > learner.random_steps,
             "env-steps",
             config.env_steps,
             f"more than the random steps before training (learner.random-steps "
@@ -96,6 +105,8 @@ def check(config: Config) -> None:
             learner.critic_learning_rate,
             "above 0",
         ),
+        *_start_rules("learner", learner),
+        *_start_rules("facmac", facmac),
         (learner.gradient_clip > 0, "learner.gradient-clip", learner.gradient_clip, "above 0"),
         (0 <= learner.discount < 1, "learner.discount", learner.discount, "in [0, 1)"),
         (
@@ -131,14 +142,36 @@ def check(config: Config) -> None:
         ),
         *_facmac_rules(facmac, config.n_teams),
         (
-            race.population_size >= 4 + race.elite_copy,
+            race.evolution in EVOLUTIONS or ":" in race.evolution,
+            "race.evolution",
+            race.evolution,
+            f"{', '.join(EVOLUTIONS)}, or package.module:function for your own",
+        ),
+        (race.population_size >= 3, "race.population-size", race.population_size, "at least 3"),
+        (
+            race.evolution != "ga" or race.population_size >= fewest,
             "race.population-size",
             race.population_size,
-            f"at least {4 + race.elite_copy}: an elite, a second parent, "
-            f"{'a copy of the elite, ' * race.elite_copy}a team for their offspring and one for "
-            f"the injected MARL team (4 do with --race.no-elite-copy; for no population use --algo "
-            f"{config.base})",
+            f"at least {fewest}: an elite, a second parent, "
+            f"{'a copy of the elite, ' * race.elite_copy}a team for their offspring"
+            f"{' and one for the injected MARL team' * config.has_marl} ({fewest - 1} do with "
+            f"--race.no-elite-copy; for no population use --algo {config.base})",
         ),
+        (
+            not (config.whole_teams and learner.shared_agents),
+            "learner.shared-agents",
+            learner.shared_agents,
+            "False where whole teams evolve: each of their agents has an encoder of its own",
+        ),
+        (
+            config.whole_teams or race.vfm_marl_weight + race.vfm_team_weight + race.vmm_weight > 0,
+            "race.vmm-weight",
+            race.vmm_weight,
+            "above 0 where the weights of both terms of Eq. (2) are 0, since encoders would learn "
+            "from nothing",
+        ),
+        (race.marl_episodes >= 1, "race.marl-episodes", race.marl_episodes, "at least 1"),
+        (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         *_population_rules(race),
         *_env_rules(config.env),
         (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
@@ -201,20 +234,30 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
     ]
 
 
+def _start_rules(group: str, settings: LearnerConfig | FacmacConfig) -> list[Rule]:
+    rate, scale = settings.encoder_learning_rate, settings.last_layer_scale
+    return [
+        (rate is None or rate > 0, f"{group}.encoder-learning-rate", rate, "above 0"),
+        (scale > 0, f"{group}.last-layer-scale", scale, "above 0"),
+    ]
+
+
 def _population_rules(race: RaceConfig) -> list[Rule]:
     shares = (
         *("mutation_fraction", "mutation_probability", "agent_mutation_probability"),
         *("crossover_probability", "injection_probability", "value_awareness"),
-        *("strong_share", "reset_share"),
+        *("strong_share", "reset_share", "cem_elite_share", "cem_noise_decay"),
     )
     not_negative = (
         *("vmm_weight", "vfm_marl_weight", "vfm_team_weight"),
-        *("strong_strength", "mild_strength"),
+        *("strong_strength", "mild_strength", "cem_noise_start", "cem_noise_end"),
     )
+    above_0 = ("es_noise", "es_learning_rate")
     positive = ("tournament_size", "policy_embedding_size", "mine_size")
     value = race.__getattribute__
     rules: list[Rule] = [(0 <= value(name) <= 1, name, value(name), "in [0, 1]") for name in shares]
     rules += [(value(name) >= 0, name, value(name), "0 or more") for name in not_negative]
+    rules += [(value(name) > 0, name, value(name), "above 0") for name in above_0]
     rules += [(value(name) >= 1, name, value(name), "at least 1") for name in positive]
     largest, total = race.largest_weight, race.strong_share + race.reset_share
     rules += [

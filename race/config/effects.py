@@ -4,13 +4,33 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+from race.config.hyper import NUMBERS_OF_EVOLUTIONS
 from race.config.settings import Config, EnvConfig, FacmacConfig, LearnerConfig, RaceConfig
 from race.errors import ConfigError
+
+NETWORKS = {
+    "learner": ("hidden_sizes", "layer_norm"),
+    "facmac": ("hidden_size", "layer_norm", "replay_precision"),
+}
+"""Of the learner's settings, those that matter where nothing is learned by gradients."""
 
 _MATD3_ALONE = ("policy_delay", "smoothing_noise", "smoothing_clip")
 _MIXER = ("mixer_size", "hypernet_size")
 _OBSERVATION = ("agent_obsk", "local_categories", "global_categories")
 _HOST = ("processes", "retries", "step_seconds")
+_SHARED_ENCODERS = (
+    *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
+    *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
+)
+_BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
+_OF_EVOLUTIONS = {
+    "ga": (
+        *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),
+        *NUMBERS_OF_EVOLUTIONS["ga"],
+    ),
+    "cem": NUMBERS_OF_EVOLUTIONS["cem"],
+    "es": NUMBERS_OF_EVOLUTIONS["es"],
+}
 
 
 def refuse_without_effect(
@@ -55,29 +75,8 @@ def _idle(
     asked: Config, *, discrete: bool, reads_env: bool, on_host: bool
 ) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
-    evolves = asked.has_population
-    usual = "facmac" if discrete else "matd3"
-    base = asked.base or usual if evolves else asked.algo
-    if not evolves:
-        why = f"with --algo {asked.algo}, which has no population"
-        yield from ((f"race.{name}", why) for name in _names(RaceConfig))
-        if asked.base != asked.algo:
-            yield "base", f"with --algo {asked.algo}, which is its own gradient learner"
-    if discrete:
-        why = (
-            f"on {asked.task}. Its actions are discrete; the settings of its learner are --facmac.*"
-        )
-        yield from ((f"learner.{name}", why) for name in _names(LearnerConfig))
-        if not evolves:
-            yield "facmac.value_size", "without a population, which alone has a state-value net"
-    else:
-        why = f"on {asked.task}. Its actions are continuous; its learner's settings are --learner.*"
-        mixes = _MIXER if base == "facmac" else ()
-        yield from ((f"facmac.{name}", why) for name in _names(FacmacConfig) if name not in mixes)
-        if base != "matd3":
-            yield from (
-                (f"learner.{name}", f"with {base}: MATD3 alone has it") for name in _MATD3_ALONE
-            )
+    yield from _idle_of_population(asked)
+    yield from _idle_of_learner(asked, discrete)
     if not reads_env:
         why = f"on {asked.task}, whose agents observe what they do in any case"
         yield from ((f"env.{name}", why) for name in (*_OBSERVATION, "library_observation"))
@@ -87,6 +86,52 @@ def _idle(
     if not on_host:
         why = f"on {asked.task}, which runs in one compiled program"
         yield from ((f"env.{name}", why) for name in _HOST)
+
+
+def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
+    race = asked.race
+    if not asked.has_population:
+        why = f"with --algo {asked.algo}, which has no population"
+        yield from ((f"race.{name}", why) for name in _names(RaceConfig))
+        return
+    if asked.whole_teams:
+        own = f"with --algo {asked.algo}" if asked.algo != "race" else "with --race.no-sharing"
+        names = [*_SHARED_ENCODERS, *["sharing"] * (asked.algo != "race")]
+        yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
+    if not asked.has_marl:
+        why = f"with --algo {asked.algo}, which has no MARL team"
+        yield from ((f"race.{name}", why) for name in _BESIDE_MARL)
+    for evolution, settings in _OF_EVOLUTIONS.items():
+        if evolution != race.evolution:
+            why = f"with --race.evolution {race.evolution}: it is of {evolution}"
+            yield from ((f"race.{name}", why) for name in settings)
+
+
+def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
+    evolves, algo = asked.has_population, asked.algo
+    base = asked.base or ("facmac" if discrete else "matd3") if evolves else algo
+    if not evolves and asked.base != algo:
+        yield "base", f"with --algo {algo}, which is its own gradient learner"
+    if not asked.has_marl:
+        why = f"with --algo {algo}, where nothing is learned by gradients"
+        yield "base", why
+        group, kind = ("facmac", FacmacConfig) if discrete else ("learner", LearnerConfig)
+        idle = (name for name in _names(kind) if name not in NETWORKS[group])
+        yield from ((f"{group}.{name}", why) for name in idle)
+    if discrete:
+        why = (
+            f"on {asked.task}. Its actions are discrete; the settings of its learner are --facmac.*"
+        )
+        yield from ((f"learner.{name}", why) for name in _names(LearnerConfig))
+        if asked.has_marl and (not evolves or asked.whole_teams):
+            yield "facmac.value_size", "without shared encoders, which alone need state values"
+        return
+    why = f"on {asked.task}. Its actions are continuous; its learner's settings are --learner.*"
+    mixes = _MIXER if base == "facmac" and asked.has_marl else ()
+    yield from ((f"facmac.{name}", why) for name in _names(FacmacConfig) if name not in mixes)
+    if base != "matd3" and asked.has_marl:
+        why = f"with {base}: MATD3 alone has it"
+        yield from ((f"learner.{name}", why) for name in _MATD3_ALONE)
 
 
 def _names(group: Any) -> list[str]:

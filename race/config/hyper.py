@@ -18,6 +18,7 @@ class Hyper(NamedTuple):
     """
 
     actor_learning_rate: Number
+    encoder_learning_rate: Number
     critic_learning_rate: Number
     gradient_clip: Number
     discount: Number
@@ -28,6 +29,7 @@ class Hyper(NamedTuple):
     smoothing_clip: Number
     td_lambda: Number
     """lambda of FACMAC's targets on discrete actions."""
+    last_layer_scale: Number
     mutation_fraction: Number
     """alpha"""
     mutation_probability: Number
@@ -40,6 +42,12 @@ class Hyper(NamedTuple):
     mild_strength: Number
     largest_weight: Number
     """Infinite where there is no bound."""
+    cem_elite_share: Number
+    cem_noise_start: Number
+    cem_noise_end: Number
+    cem_noise_decay: Number
+    es_noise: Number
+    es_learning_rate: Number
     vmm_weight: Number
     """beta, the weight of Eq. (5) in Eq. (6)."""
     vfm_marl_weight: Number
@@ -47,6 +55,22 @@ class Hyper(NamedTuple):
     """Weights of the two terms of Eq. (2)."""
     value_awareness: Number
     """1: Eq. (5) with its weights; 0: with all weights 1."""
+
+
+_OF_GRADIENTS = (
+    *("actor_learning_rate", "encoder_learning_rate", "critic_learning_rate", "gradient_clip"),
+    *("discount", "target_update_rate", "smoothing_noise", "smoothing_clip", "td_lambda"),
+    "last_layer_scale",
+)
+NUMBERS_OF_EVOLUTIONS = {
+    "ga": (
+        *("mutation_fraction", "mutation_probability", "agent_mutation_probability"),
+        *("crossover_probability", "strong_share", "reset_share", "strong_strength"),
+        *("mild_strength", "largest_weight"),
+    ),
+    "cem": ("cem_elite_share", "cem_noise_start", "cem_noise_end", "cem_noise_decay"),
+    "es": ("es_noise", "es_learning_rate"),
+}
 
 
 def hyper_of(config: Config) -> Hyper:
@@ -60,10 +84,23 @@ def hyper_of(config: Config) -> Hyper:
         "td_lambda": facmac.td_lambda if config.discrete else unused,
     }
     shared: Any = facmac if config.discrete else learner
-    for name in ("actor_learning_rate", "critic_learning_rate", "gradient_clip", "discount"):
+    numbers["encoder_learning_rate"] = shared.encoder_learning_rate or shared.actor_learning_rate
+    for name in (
+        *("actor_learning_rate", "critic_learning_rate", "gradient_clip", "discount"),
+        "last_layer_scale",
+    ):
         numbers[name] = getattr(shared, name)
     for name in set(Hyper._fields) - set(numbers):  # the rest is the population's
         numbers[name] = getattr(race, name) if config.has_population else unused
+    idle = set()
+    if config.whole_teams:
+        idle |= {"vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"}
+    if not config.has_marl:
+        idle |= {"injection_probability", *_OF_GRADIENTS}
+    if config.has_population:
+        used = NUMBERS_OF_EVOLUTIONS.get(race.evolution, ())
+        idle |= {name for of in NUMBERS_OF_EVOLUTIONS.values() for name in of if name not in used}
+    numbers |= dict.fromkeys(idle, unused)
     if numbers["largest_weight"] is None:
         numbers["largest_weight"] = float("inf")
     return Hyper(**{name: np.float32(number) for name, number in numbers.items()})

@@ -1,6 +1,7 @@
 """Presets: the paper's alpha and beta per task, sets of learner settings, and filling them in."""
 
 import dataclasses
+from typing import Any
 
 from race.config.checks import check
 from race.config.settings import Base, Config, LearnerConfig, ReplayPrecision
@@ -61,7 +62,16 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
         # The library spells partitions of Humanoid with a bar, the paper's tasks with an x.
         config = dataclasses.replace(config, task=config.task.replace("|", "x"))
     alpha, beta = TABLES.get(config.task, (0.05 if discrete else 0.5, 1e-2))
-    race = config.race
+    race, whole = config.race, config.algo in ("merl", "ea")
+    if whole:  # the genetic algorithm of Khadka and Tumer (2018)
+        alpha = 0.1
+    operators: dict[str, Any] = {
+        "crossover": "layer" if whole else "agent",
+        "mutation": "layer" if whole else "agent",
+        "mutation_draw": "weight" if whole else "row",
+    }
+    unset = {name: value for name, value in operators.items() if getattr(race, name) is None}
+    race = dataclasses.replace(race, **unset)
     if race.mutation_fraction is None:
         race = dataclasses.replace(race, mutation_fraction=alpha)
     if race.vmm_weight is None:
@@ -71,7 +81,11 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
         evaluation = dataclasses.replace(evaluation, every=10_000 if discrete else 5_000)
     if evaluation.episodes is None:
         evaluation = dataclasses.replace(evaluation, episodes=32 if discrete else 10)
-    base: Base = config.algo if config.algo != "race" else config.base or _usual_base(discrete)
+    base: Base = _usual_base(discrete)
+    if config.algo == "race" or config.algo == "merl":
+        base = config.base or base
+    elif config.algo != "ea":
+        base = config.algo
     facmac = config.facmac
     if facmac.replay_precision is None:
         precision: ReplayPrecision = "float16" if config.task.startswith("micro/") else "float32"

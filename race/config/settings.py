@@ -13,12 +13,15 @@ import tyro
 
 from race.errors import ConfigError
 
-Algo = Literal["race", "matd3", "maddpg", "facmac"]
+Algo = Literal["race", "merl", "ea", "matd3", "maddpg", "facmac"]
 Base = Literal["matd3", "maddpg", "facmac"]
 Preset = Literal["paper", "td3", "demo"]
 ReplayPrecision = Literal["float16", "float32"]
 MutationDraw = Literal["row", "weight"]
 Level = Literal["agent", "parameter", "layer"]
+Selection = Literal["team", "agent"]
+TeamDraw = Literal["once", "each"]
+EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
 
 
@@ -30,10 +33,17 @@ class LearnerConfig:
     """Units of the two layers of each encoder and critic (Table 1, Table 2)."""
     layer_norm: bool = True
     """Normalise the layers of encoders, critics and PeVFA before each activation."""
+    shared_agents: bool = False
+    """One encoder for all agents, which is told the agent's number, instead of one each."""
+    last_layer_scale: float = 1.0
+    """What the last layers of the MARL team, the critic and the PeVFA are multiplied by at the
+    start."""
     batch_size: int = 128
     """Transitions in a minibatch."""
     actor_learning_rate: float = 1e-3
     """Adam step size of the encoders and the MARL team's heads."""
+    encoder_learning_rate: float | None = None
+    """That of the encoders, if it is to be another."""
     critic_learning_rate: float = 1e-3
     """Adam step size of the critic, the PeVFA, the state-value net and MINE."""
     gradient_clip: float = 10.0
@@ -54,8 +64,10 @@ class LearnerConfig:
     """Transitions that the replay buffer holds."""
     random_steps: int = 10_000
     """Environment steps of uniformly random actions before the first generation."""
+    random_steps_owed: bool = False
+    """The random steps too are owed gradient steps, all in the first generation."""
     gradient_steps_per_env_step: float = 1.0
-    """Gradient steps for each environment step collected after the random ones."""
+    """Gradient steps for each environment step that is owed some."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +93,11 @@ class FacmacConfig:
     """Episodes in a minibatch."""
     actor_learning_rate: float = 2.5e-3
     """Adam step size of the encoder and the MARL team's head."""
+    encoder_learning_rate: float | None = None
+    """That of the encoder, if it is to be another."""
+    last_layer_scale: float = 1.0
+    """What the last layers of the MARL team, the utilities and their PeVFA are multiplied by at
+    the start."""
     critic_learning_rate: float = 5e-4
     """Adam step size of utilities, mixers, the state-value net and MINE."""
     gradient_clip: float = 10.0
@@ -112,9 +129,27 @@ class RaceConfig:
 
     population_size: int = 5
     """Teams of the population, the paper's n."""
+    evolution: str = "ga"
+    """How the population evolves: ga (the paper's genetic algorithm), cem (cross-entropy method),
+    es (evolution strategy), or package.module:function for your own."""
+    cem_elite_share: float = 0.5
+    """Share of the population that the cross-entropy method moves towards."""
+    cem_noise_start: float = 1e-3
+    """What it adds to the variance of each weight, at first."""
+    cem_noise_end: float = 1e-5
+    """The same in the end."""
+    cem_noise_decay: float = 0.95
+    """What is left of the difference of the two after a generation."""
+    es_noise: float = 0.05
+    """Standard deviation of the teams around the evolution strategy's mean."""
+    es_learning_rate: float = 0.02
+    """Adam step size of its mean."""
+    sharing: bool = True
+    """All teams share the encoders. Without, each team of the population has networks of its own,
+    and there is no PeVFA: MERL with agent-level operators."""
     mutation_fraction: float | None = None
     """Share of a picked head's weights that mutate, the paper's alpha. None: Tables 3 and 4, else
-    0.5, on tasks with discrete actions 0.05."""
+    0.5, on tasks with discrete actions 0.05; with merl and ea 0.1."""
     vmm_weight: float | None = None
     """Weight of Value-Aware MI Maximization, the paper's beta. None: Tables 3 and 4, else
     0.01."""
@@ -133,9 +168,18 @@ class RaceConfig:
     """Probability that a team that is not the elite mutates."""
     agent_mutation_probability: float = 0.5
     """Probability that an agent of a mutating team is picked (at least one is)."""
-    mutation_draw: MutationDraw = "row"
-    """Whether a mutation's kind (strong, reset or mild) is drawn once per action row of a picked
-    head or once per weight."""
+    crossover: Level | None = None
+    """What two parents exchange: policies of agents, rows of whole teams with no regard to agents
+    (parameter), or rows of random layers. None: agent, with merl and ea layer."""
+    mutation: Level | None = None
+    """What a mutation draws its weights from: the policies of picked agents, whole teams with no
+    regard to agents (parameter), or random layers. None: agent, with merl and ea layer."""
+    selection: Selection = "team"
+    """Whether parents, and who gives way to offspring, are chosen once per team or for each agent
+    anew; fitness and elite are the team's."""
+    mutation_draw: MutationDraw | None = None
+    """Whether a mutation's kind (strong, reset or mild) is drawn once per row or once per weight.
+    None: row, with merl and ea weight."""
     strong_share: float = 0.05
     """Share of mutations that are strong, N(0, (strong-strength w)^2) for a weight w."""
     reset_share: float = 0.05
@@ -148,6 +192,17 @@ class RaceConfig:
     """What mutates is kept within it. None: no bound."""
     elite_copy: bool = True
     """A copy of the elite enters the next population and is open to mutation."""
+    team_draw: TeamDraw = "once"
+    """Whether a gradient step draws one team of the population for both Eqs. (1) and (2) or one
+    for each."""
+    marl_among_teams: bool = False
+    """The MARL team is among the teams that are drawn."""
+    one_pevfa: bool = False
+    """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
+    marl_episodes: int = 1
+    """Episodes of the MARL team in a generation, for one of each team of the population."""
+    evolution_from: int = 0
+    """Environment steps before which the MARL team plays alone and nothing evolves."""
     tournament_size: int = 3
     """Teams from which the second parent is the best."""
     policy_embedding_size: int = 64
@@ -239,18 +294,36 @@ class Config:
 
     @property
     def has_population(self) -> bool:
-        """Whether teams evolve beside the MARL team."""
-        return self.algo == "race"
+        """Whether teams evolve."""
+        return self.algo in ("race", "merl", "ea")
+
+    @property
+    def has_marl(self) -> bool:
+        """Whether there is a MARL team, and so anything to learn by gradients."""
+        return self.algo != "ea"
+
+    @property
+    def whole_teams(self) -> bool:
+        """Whether whole networks evolve instead of heads over shared encoders."""
+        return self.has_population and not (self.algo == "race" and self.race.sharing)
+
+    @property
+    def n_marl_teams(self) -> int:
+        """Episodes of the MARL team in a generation, all at once."""
+        if not self.has_marl:
+            return 0
+        return self.race.marl_episodes if self.has_population else 1
 
     @property
     def n_teams(self) -> int:
-        """Teams that act: the population and the MARL team."""
-        return self.race.population_size + 1 if self.has_population else 1
+        """Teams that act: the population and the MARL team, as often as it plays."""
+        return self.race.population_size * self.has_population + self.n_marl_teams
 
     @property
     def method(self) -> str:
         """The method's name as figures show it, such as ``RACE(MATD3)``."""
-        return f"RACE({str(self.base).upper()})" if self.algo == "race" else self.algo.upper()
+        name = self.algo.upper()
+        return f"{name}({str(self.base).upper()})" if self.algo in ("race", "merl") else name
 
     @property
     def policy_delay(self) -> int:
@@ -283,6 +356,26 @@ _BEFORE: dict[str, Any] = {
     "mild_strength": 0.1,
     "largest_weight": 10.0,
     "ablation": (),
+    "shared_agents": False,
+    "last_layer_scale": 1.0,
+    "encoder_learning_rate": None,
+    "crossover": "agent",
+    "mutation": "agent",
+    "selection": "team",
+    "team_draw": "once",
+    "marl_among_teams": False,
+    "one_pevfa": False,
+    "sharing": True,
+    "evolution": "ga",
+    "cem_elite_share": 0.5,
+    "cem_noise_start": 1e-3,
+    "cem_noise_end": 1e-5,
+    "cem_noise_decay": 0.95,
+    "es_noise": 0.05,
+    "es_learning_rate": 0.02,
+    "marl_episodes": 1,
+    "evolution_from": 0,
+    "random_steps_owed": False,
 }
 
 

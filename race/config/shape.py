@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from race.config.settings import Base, Config, MutationDraw
+from race.config.settings import Base, Config, Level, MutationDraw, Selection, TeamDraw
 
 
 @dataclass(frozen=True)
@@ -10,8 +10,8 @@ class Shape:
     """Sizes, periods and choices of operators; a static argument of the compiled programs.
 
     Runs of equal shapes on one task share their programs, whatever their `race.config.hyper.Hyper`
-    and seeds. Settings of a run that no program reads are neither here nor there. Without a
-    population, what belongs to one is 0 and has no say.
+    and seeds. Settings of a run that no program reads are neither here nor there: what belongs to a
+    population, a MARL team or an evolution that is not there is 0 or empty.
     """
 
     base: Base
@@ -37,6 +37,14 @@ class Shape:
     mine_size: int
     mutation_draw: MutationDraw
     elite_copy: bool
+    evolution: str
+    crossover: Level
+    mutation: Level
+    selection: Selection
+    team_draw: TeamDraw
+    marl_among_teams: bool
+    one_pevfa: bool
+    shared_agents: bool
 
     @property
     def embedding_size(self) -> int:
@@ -48,23 +56,36 @@ def shape_of(config: Config) -> Shape:
     """The shape of a run of a resolved configuration."""
     assert config.base is not None
     learner, facmac, race = config.learner, config.facmac, config.race
-    mixes, evolves = config.base == "facmac", config.has_population
+    discrete, learns, evolves = config.discrete, config.has_marl, config.has_population
+    mixes = learns and config.base == "facmac"
+    represents = evolves and not config.whole_teams  # encoders for all teams
+    genetic = evolves and race.evolution == "ga"
+    critic_sizes = facmac.utility_sizes if discrete else learner.hidden_sizes
+    value_sizes = (facmac.value_size,) if discrete else learner.hidden_sizes
     return Shape(
         base=config.base,
-        discrete=config.discrete,
-        layer_norm=facmac.layer_norm if config.discrete else learner.layer_norm,
-        batch_size=facmac.batch_size if config.discrete else learner.batch_size,
-        policy_delay=config.policy_delay,
-        target_update_every=facmac.target_update_every if config.discrete else 0,
-        hidden_sizes=(facmac.hidden_size,) if config.discrete else learner.hidden_sizes,
-        critic_sizes=facmac.utility_sizes if config.discrete else learner.hidden_sizes,
-        value_sizes=(facmac.value_size,) if config.discrete else learner.hidden_sizes,
-        mixer_size=facmac.mixer_size if mixes else 0,
-        hypernet_size=facmac.hypernet_size if mixes else 0,
-        population_size=race.population_size if evolves else 0,
-        tournament_size=race.tournament_size if evolves else 0,
-        policy_embedding_size=race.policy_embedding_size if evolves else 0,
-        mine_size=race.mine_size if evolves else 0,
-        mutation_draw=race.mutation_draw if evolves else "row",
-        elite_copy=race.elite_copy and evolves,
+        discrete=discrete,
+        layer_norm=facmac.layer_norm if discrete else learner.layer_norm,
+        batch_size=learns * (facmac.batch_size if discrete else learner.batch_size),
+        policy_delay=config.policy_delay if learns else 1,
+        target_update_every=facmac.target_update_every if discrete and learns else 0,
+        hidden_sizes=(facmac.hidden_size,) if discrete else learner.hidden_sizes,
+        critic_sizes=critic_sizes if learns else (0, 0),
+        value_sizes=value_sizes if represents else (),
+        mixer_size=facmac.mixer_size * mixes,
+        hypernet_size=facmac.hypernet_size * mixes,
+        population_size=race.population_size * evolves,
+        tournament_size=race.tournament_size * genetic,
+        policy_embedding_size=race.policy_embedding_size * represents,
+        mine_size=race.mine_size * represents,
+        mutation_draw=race.mutation_draw if genetic and race.mutation_draw else "row",
+        elite_copy=race.elite_copy and genetic,
+        evolution=race.evolution if evolves else "ga",
+        crossover=race.crossover if genetic and race.crossover else "agent",
+        mutation=race.mutation if genetic and race.mutation else "agent",
+        selection=race.selection if genetic else "team",
+        team_draw=race.team_draw if represents else "once",
+        marl_among_teams=race.marl_among_teams and represents,
+        one_pevfa=race.one_pevfa and represents,
+        shared_agents=learner.shared_agents and not discrete,
     )

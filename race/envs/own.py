@@ -1,21 +1,19 @@
 """Tasks of the user's own: modules that define them, and gymnasium environments made into them."""
 
 import contextlib
-import importlib
 import inspect
 import re
-import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from race import loading
 from race.config.settings import EnvConfig
 from race.envs import contract
 from race.envs.checked import takes
-from race.errors import HandedOverError, TaskError, blamed, described
+from race.errors import HandedOverError, TaskError, blamed
 from race.types import AnyTask, DiscreteTask, EnvSpec, Name, Task, Whole
 
 
@@ -30,35 +28,12 @@ def own_function(task_id: str) -> Callable[..., Any]:
     Raises:
         TaskError: if there is none, or its module cannot be imported.
     """
-    module_name, function_name = task_id.split(":")
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module_name}.".startswith(f"{error.name}."):
-            raise TaskError(
-                f"Task {task_id}: importing {module_name} failed, because it needs the module "
-                f"{error.name}, which is not installed."
-            ) from error
-        raise TaskError(
-            f"Task {task_id}: there is no module {error.name}. It is looked for in the current "
-            f"directory ({Path.cwd()}) and among the installed packages; the name is that of the "
-            "file without .py, with dots for folders."
-        ) from error
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:
-        raise TaskError(
-            f"Task {task_id}: importing {module_name} failed with {described(error)}."
-        ) from error
-    function = getattr(module, function_name, None)
-    if not callable(function):
-        raise TaskError(
-            f"Task {task_id}: {module_name} ({module.__file__}) has no function {function_name}. "
-            "Define one that returns a race.types.Task, for example with race.envs.factorised."
-        )
-    return function
+    return loading.own_function(
+        task_id,
+        TaskError,
+        "Task",
+        "Define one that returns a race.types.Task, for example with race.envs.factorised.",
+    )
 
 
 def takes_config(function: Callable[..., Any]) -> bool:

@@ -30,6 +30,10 @@ class Learner(NamedTuple):
 
     init_encoder: Callable[..., Any]
     """(key, spec, shape) -> the encoders of all agents."""
+    init_own_encoder: Callable[..., Any]
+    """(key, spec, shape) -> those of a team that shares none: one per agent, leaves [N, ...]."""
+    of_each_agent: Callable[[Any], Any]
+    """The MARL team's encoders -> the same as one per agent, leaves [N, ...]."""
     init_head: Callable[..., Float[Array, "_ H1 A"]]
     """(key, spec, shape) -> the MARL team's policy representations: one per agent, or one that
     all agents share."""
@@ -72,5 +76,7 @@ class Learner(NamedTuple):
     """(mine, moments, z, key) -> the signals I_t below Eq. (3) of each MINE."""
     policy_due: Callable[..., bool | Bool[Array, ""]]
     """(step, shape) -> whether this gradient step also trains policies and moves targets."""
+    scale_output: Callable[..., Any]
+    """(critic or PeVFA, number) -> the same with its last layer multiplied."""
     follow: Callable[..., Any]
     """(target, online, step, shape, hyper) -> the targets after this gradient step."""

@@ -9,6 +9,7 @@ A minibatch of episodes comes as `Slots`; its samples are all slots but the last
 first: ``B = (L - 1) * R``. Joint actions are one-hot, ``[B, N, A]``.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +26,12 @@ from race.networks import critics, factored
 from race.networks.critics import StateValue
 from race.networks.dense import Mine, init_one_head, init_one_mine
 from race.networks.factored import FactoredCritic, FactoredPevfa
-from race.networks.recurrent import GruEncoder, embed_episodes, init_gru_encoder
+from race.networks.recurrent import (
+    GruEncoder,
+    embed_episodes,
+    init_gru_encoder,
+    of_each_agent,
+)
 from race.types import DiscreteSpec, Slots
 
 GROUP = 32
@@ -49,6 +55,15 @@ def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> GruEncod
     """A fresh encoder, one for all agents."""
     size, layer_norm = shape.embedding_size, shape.layer_norm
     return init_gru_encoder(key, spec.obs_size, spec.n_actions, spec.n_agents, size, layer_norm)
+
+
+def new_own_encoder(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> GruEncoder:
+    """Fresh encoders, one per agent."""
+    keys = jax.random.split(key, spec.n_agents)
+    every = jax.vmap(lambda key: new_encoder(key, spec, shape))(keys)
+    # Of the numbers of all agents, which each has drawn, its own.
+    own = every.agent[jnp.arange(spec.n_agents), jnp.arange(spec.n_agents)]
+    return dataclasses.replace(every, agent=own[:, None])
 
 
 def new_head(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> Float[Array, "1 H1 A"]:
@@ -279,6 +294,8 @@ def follow(target: Any, online: Any, step: Int[Array, ""], shape: Shape, hyper: 
 
 facmac = Learner(
     init_encoder=new_encoder,
+    init_own_encoder=new_own_encoder,
+    of_each_agent=of_each_agent,
     init_head=new_head,
     init_heads=new_heads,
     init_critic=new_critic,
@@ -299,6 +316,7 @@ facmac = Learner(
     state_values=state_values,
     mutual_information=mutual_information,
     policy_due=policy_due,
+    scale_output=factored.scale_output,
     follow=follow,
 )
 """FACMAC, the paper's base method on discrete tasks."""

@@ -111,5 +111,6 @@ facmac_continuous = maddpg._replace(
     q_team=q_team,
     first_critic=same_critic,
     first_pevfa=same_pevfa,
+    scale_output=factored.scale_output,
 )
 """FACMAC on tasks with continuous actions."""

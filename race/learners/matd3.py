@@ -27,8 +27,14 @@ N_CRITICS = 2
 
 
 def new_encoder(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Encoder:
-    """Fresh encoders of all agents."""
-    return networks.init_encoder(key, spec, shape.hidden_sizes, shape.layer_norm)
+    """Fresh encoders of all agents, or one for all."""
+    sizes, layer_norm = shape.hidden_sizes, shape.layer_norm
+    return networks.init_encoder(key, spec, sizes, layer_norm, shape.shared_agents)
+
+
+def as_they_are(encoder: Encoder) -> Encoder:
+    """There is one per agent anyway."""
+    return encoder
 
 
 def new_head(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Float[Array, "N H1 A"]:
@@ -63,8 +69,9 @@ def new_value(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> StateValue:
 
 
 def new_mine(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Mine:
-    """One fresh MINE network per agent."""
-    return networks.init_mine(key, spec, shape.embedding_size, shape.mine_size)
+    """One fresh MINE network per encoder."""
+    count = 1 if shape.shared_agents else spec.n_agents
+    return networks.init_mine(key, spec, shape.embedding_size, shape.mine_size, count)
 
 
 def now(batch: Transition, spec: EnvSpec) -> Samples:
@@ -150,9 +157,15 @@ def state_values(value: StateValue, state: Float[Array, "B S"]) -> Float[Array, 
 
 def mutual_information(
     mine: Mine, state: Float[Array, "B S"], z: Float[Array, "N B H"], key: PRNGKeyArray
-) -> Float[Array, "N B"]:
-    """Signals of every agent; the other samples of the batch are the negatives."""
-    return jax.vmap(mutual_information_signal)(mine_scores(mine, state, z))
+) -> Float[Array, "M B"]:
+    """Signals of every encoder; the other samples of the batch are the negatives.
+
+    That of an encoder of all agents is their mean.
+    """
+    signal = jax.vmap(mutual_information_signal)(mine_scores(mine, state, z))
+    if mine.state_out.bias.shape[0] < signal.shape[0]:
+        return jnp.mean(signal, axis=0, keepdims=True)
+    return signal
 
 
 def policy_due(step: Int[Array, ""], shape: Shape) -> Bool[Array, ""]:
@@ -167,6 +180,8 @@ def follow(target: Any, online: Any, step: Int[Array, ""], shape: Shape, hyper: 
 
 matd3 = Learner(
     init_encoder=new_encoder,
+    init_own_encoder=new_encoder,
+    of_each_agent=as_they_are,
     init_head=new_head,
     init_heads=new_head,
     init_critic=new_critic,
@@ -187,6 +202,7 @@ matd3 = Learner(
     state_values=state_values,
     mutual_information=mutual_information,
     policy_due=policy_due,
+    scale_output=critics.scale_output,
     follow=follow,
 )
 """MATD3, the paper's base method on continuous tasks."""

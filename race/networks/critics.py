@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from race.config.hyper import Number
 from race.networks.dense import (
     Dense,
     PolicyEmbedding,
@@ -138,6 +139,16 @@ def pevfa_values(
 def first_pevfa(pevfa: Pevfa) -> Pevfa:
     """The first critic of the PeVFA alone."""
     return Pevfa(first_critic(pevfa.critic), pevfa.embedding, pevfa.embedding_weight[:1])
+
+
+def scale_output(critic: Critic | Pevfa, scale: Number) -> Critic | Pevfa:
+    """A critic or PeVFA with its last layer multiplied."""
+
+    def last(critic: Critic | Pevfa) -> Dense:
+        return (critic.critic if isinstance(critic, Pevfa) else critic).out
+
+    scaled: Critic | Pevfa = eqx.tree_at(last, critic, last(critic).scaled(scale))
+    return scaled
 
 
 class StateValue(eqx.Module):

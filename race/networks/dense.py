@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from race.config.hyper import Number
 from race.types import EnvSpec
 
 
@@ -25,6 +26,10 @@ class Dense(eqx.Module):
     def __call__(self, x: Float[Array, "... i"]) -> Float[Array, "... o"]:
         """Maps ``[*stack, B, in]`` to ``[*stack, B, out]``."""
         return jnp.matmul(x, self.weight) + self.bias[..., None, :]
+
+    def scaled(self, scale: Number) -> "Dense":
+        """The layer with weights and biases multiplied."""
+        return Dense(self.weight * scale, self.bias * scale)
 
 
 def init_dense(
@@ -61,18 +66,36 @@ def stack(trees: list[Any]) -> Any:
 
 
 class Encoder(eqx.Module):
-    """The nonlinear observation encoders Z_phi of all agents, stacked (Table 1, left)."""
+    """The nonlinear observation encoders Z_phi of all agents, stacked (Table 1, left).
+
+    Where one serves all agents, the stack holds that one, and ``agent`` is what the agent's number
+    adds to its first layer.
+    """
 
     hidden: Dense  # weight [N, O, h1]
     out: Dense  # weight [N, h1, H]
     layer_norm: bool = eqx.field(static=True)  # before each activation
+    agent: Float[Array, "N h1"] | None = None
 
 
 def init_encoder(
-    key: PRNGKeyArray, spec: EnvSpec, hidden_sizes: tuple[int, ...], layer_norm: bool
+    key: PRNGKeyArray,
+    spec: EnvSpec,
+    hidden_sizes: tuple[int, ...],
+    layer_norm: bool,
+    shared_agents: bool = False,
 ) -> Encoder:
-    """Fresh encoders, one per agent. Rows of padded observation entries are never used."""
+    """Fresh encoders, one per agent or one for all.
+
+    Rows of padded observation entries are never used.
+    """
     h1, h2 = hidden_sizes
+    if shared_agents:
+        k1, k2, k3 = jax.random.split(key, 3)
+        inputs = spec.obs_size + spec.n_agents
+        layers = stack([init_dense(k1, spec.obs_size, h1, fan_in=inputs)])
+        numbers = init_dense(k3, spec.n_agents, h1, fan_in=inputs).weight
+        return Encoder(layers, stack([init_dense(k2, h1, h2)]), layer_norm, numbers)
     agents = []
     for agent_key, size in zip(jax.random.split(key, spec.n_agents), spec.obs_sizes, strict=True):
         k1, k2 = jax.random.split(agent_key)
@@ -89,8 +112,15 @@ def encode(encoder: Encoder, spec: EnvSpec, state: Float[Array, "B S"]) -> Float
     obs = jnp.moveaxis(jnp.take(state, spec.obs_gather, axis=1), 1, 0)  # [N, B, O]
     if not spec.obs_mask.all():
         obs = obs * jnp.asarray(spec.obs_mask, obs.dtype)[:, None, :]
-    x = encoder.hidden(obs)
+    if encoder.agent is None:
+        x = encoder.hidden(obs)
+    else:
+        # All agents are samples of one layer, to which their numbers add.
+        n, b = obs.shape[:2]
+        x = encoder.hidden(obs.reshape(1, n * b, -1)).reshape(n, b, -1) + encoder.agent[:, None]
+        x = x.reshape(1, n * b, -1)
     x = encoder.out(jnp.tanh(before_activation(x, encoder.layer_norm)))
+    x = x.reshape(*obs.shape[:2], -1)
     return jnp.tanh(before_activation(x, encoder.layer_norm))
 
 
@@ -172,9 +202,9 @@ class Mine(eqx.Module):
     embedding: Dense  # weight [N, H, M]
 
 
-def init_mine(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int, size: int) -> Mine:
-    """One fresh network per agent."""
-    keys = jax.random.split(key, spec.n_agents)
+def init_mine(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int, size: int, count: int) -> Mine:
+    """Fresh networks, one per encoder (Appendix A.1)."""
+    keys = jax.random.split(key, count)
     return stack([init_one_mine(k, spec.state_size, embedding_size, size) for k in keys])
 
 
@@ -193,12 +223,16 @@ def mine_scores(
 ) -> Float[Array, "N B B"]:
     """``T_omega(s_t, z_k)`` for every state t and embedding k of the batch, per agent.
 
+    One network may serve all agents.
+
     The paper gives the two encoders and leaves open how they meet; here it is the inner product,
     which scores all B^2 pairs with one matrix product.
     """
-    # One copy per agent, as in the critics.
-    x = jnp.broadcast_to(state, (z.shape[0], *state.shape))
+    # One copy per network, as in the critics.
+    count = mine.state_out.bias.shape[0]
+    x = jnp.broadcast_to(state, (count, *state.shape))
     x = jax.nn.leaky_relu(mine.state_hidden(x))
     x = jax.nn.leaky_relu(mine.state_out(x))
-    y = mine.embedding(z)
+    y = mine.embedding(z.reshape(count, -1, z.shape[2])).reshape(*z.shape[:2], -1)
+    x = jnp.broadcast_to(x, (z.shape[0], *x.shape[1:]))
     return jnp.einsum("ntm,nkm->ntk", x, y)

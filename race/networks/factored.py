@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from race.config.hyper import Number
 from race.networks.dense import (
     Dense,
     PolicyEmbedding,
@@ -185,6 +186,19 @@ def init_pevfa(
         weight(k2, first),
         weight(k3, mixer_first),
     )
+
+
+def scale_output(
+    critic: FactoredCritic | FactoredPevfa, scale: Number
+) -> FactoredCritic | FactoredPevfa:
+    """A critic or PeVFA with the last layer of its utilities multiplied."""
+
+    def last(critic: FactoredCritic | FactoredPevfa) -> Dense:
+        inner = critic.critic if isinstance(critic, FactoredPevfa) else critic
+        return inner.utilities.out
+
+    scaled: FactoredCritic | FactoredPevfa = eqx.tree_at(last, critic, last(critic).scaled(scale))
+    return scaled
 
 
 def embedding_shifts(pevfa: FactoredPevfa, vectors: Float[Array, "U H1"]) -> tuple[Any, Any]:

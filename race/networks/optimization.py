@@ -43,6 +43,19 @@ def descend(trained: Trainable, gradient: Any, learning_rate: Number, clip: Numb
     return Trainable(optax.apply_updates(trained.params, updates), optimizer)
 
 
+def parameters(trained: Any) -> Any:
+    """The parameters of a tuple of `Trainable`, in a tuple of its kind; what is None stays None."""
+    return type(trained)(*(None if part is None else part.params for part in trained))
+
+
+def descend_all(trained: Any, gradient: Any, rates: Any, clip: Number) -> Any:
+    """`descend` for each of a tuple of `Trainable`, with a rate each; what is None stays None."""
+    parts = zip(trained, gradient, rates, strict=True)
+    return type(trained)(
+        *(None if part is None else descend(part, g, rate, clip) for part, g, rate in parts)
+    )
+
+
 def track(target: Any, online: Any, rate: Number) -> Any:
     """Moves a target network towards the online one: ``target + rate (online - target)``."""
     return jax.tree.map(lambda t, o: t + rate * (o - t), target, online)

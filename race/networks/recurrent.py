@@ -5,6 +5,8 @@ observation, its last action and its number. What is not recurrent is computed f
 once; the scan over time holds one matrix product per moment.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,8 +21,8 @@ class GruEncoder(eqx.Module):
     """The encoder Z_phi: weights of the GRU's gates side by side, reset, update, candidate."""
 
     obs: Dense  # weight [O, H]
-    last_action: Float[Array, "A H"]
-    agent: Float[Array, "N H"]
+    last_action: Float[Array, "*stack A H"]
+    agent: Float[Array, "*stack N H"]
     into: Dense  # weight [H, 3 H], input to gates
     recurrent: Dense  # weight [H, 3 H], state to gates
     layer_norm: bool = eqx.field(static=True)  # before the activation of the dense layer
@@ -47,9 +49,16 @@ def init_gru_encoder(
     )
 
 
+def of_each_agent(encoder: GruEncoder) -> GruEncoder:
+    """An encoder per agent, all leaves ``[N, ...]``, that do what the one for all agents does."""
+    agents = encoder.agent.shape[0]
+    every = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (agents, *leaf.shape)), encoder)
+    return dataclasses.replace(every, agent=encoder.agent[:, None])
+
+
 def no_memory(encoder: GruEncoder, *batch: int) -> Float[Array, "*b H"]:
     """The state of the GRU before the first moment."""
-    return jnp.zeros((*batch, encoder.recurrent.weight.shape[0]), encoder.recurrent.weight.dtype)
+    return jnp.zeros((*batch, encoder.recurrent.weight.shape[-2]), encoder.recurrent.weight.dtype)
 
 
 def gate_inputs(
@@ -91,7 +100,19 @@ def embed_step(
     obs: Float[Array, "*b N O"],
     last_action: Int[Array, "*b N"],
 ) -> Float[Array, "*b N H"]:
-    """One moment: the next state of the GRU, which is the embedding z."""
+    """One moment: the next state of the GRU, which is the embedding z.
+
+    The encoder is one for all agents, or of each agent (`of_each_agent`).
+    """
+    if encoder.recurrent.bias.ndim == 2:
+
+        def of_one(own: GruEncoder, carry: Array, obs: Array, last: Array) -> Array:
+            after = embed_step(own, carry[..., None, :], obs[..., None, :], last[..., None])
+            return after[..., 0, :]
+
+        every = jax.vmap(of_one, in_axes=(0, -2, -2, -1), out_axes=-2)
+        together: Array = every(encoder, carry, obs, last_action)
+        return together
     inputs = gate_inputs(encoder, obs, last_action)
     size = carry.shape[-1]
     flat = Gates(*(a.reshape(-1, size) for a in inputs))

@@ -75,12 +75,13 @@ class Rollouts(Protocol):
         ...
 
     def play(
-        self, teams: Teams, generation: int, env_steps: int, replay: Replay
+        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
     ) -> tuple[Replay, Generation]:
-        """One episode of every team, all of whose steps go into the buffer.
+        """One episode of every team, all of whose steps go into the buffer if it has room at all.
 
         Args:
-            teams: the population, then the MARL team, which alone explores.
+            teams: the population, then the MARL team, which alone explores, as often as it plays.
+            n_marl: how often that is.
             generation: number of the generation, from 0.
             env_steps: made before.
             replay: the buffer.

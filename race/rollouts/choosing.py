@@ -46,7 +46,8 @@ def choose(
         tick: steps made before this one; the randomness of a step depends on it and the key alone.
         how: None if nobody explores.
     """
-    z = embed_step(teams.encoder, memory.carry, seen.obs, memory.last_action)
+    embed = jax.vmap(embed_step) if teams.own_encoders else embed_step
+    z = embed(teams.encoder, memory.carry, seen.obs, memory.last_action)
     scores = jax.vmap(logits)(z, teams.heads)
     action = greedy(scores, seen.avail_actions)
     if how is not None:

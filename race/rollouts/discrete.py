@@ -67,10 +67,10 @@ class EpisodeRollouts:
 
     def empty_replay(self) -> Replay:
         """A short run does not pay for a long one's memory: an episode has at least one step."""
-        facmac = self._config.facmac
-        most = max(self._config.env_steps + self._config.n_teams, facmac.batch_size)
+        config, facmac = self._config, self._config.facmac
+        most = max(config.env_steps + config.n_teams, facmac.batch_size)
         item = empty_episode(self._spec, str(facmac.replay_precision))
-        return init_replay(item, min(facmac.replay_capacity, most))
+        return init_replay(item, min(facmac.replay_capacity, most) * config.has_marl)
 
     def warm_up(
         self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
@@ -79,7 +79,7 @@ class EpisodeRollouts:
         return replay, 0
 
     def play(
-        self, teams: Teams, generation: int, env_steps: int, replay: Replay
+        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
     ) -> tuple[Replay, Generation]:
         """The MARL team chooses at random now and then; the population explores by diversity."""
         config, facmac = self._config, self._config.facmac
@@ -87,14 +87,15 @@ class EpisodeRollouts:
             env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
         )
         how = Exploration(
-            jnp.arange(config.n_teams) == config.n_teams - 1,
+            jnp.arange(teams.count) >= teams.count - n_marl,
             jnp.float32(share),
             jax.random.fold_in(root_key(config.seed, Purpose.ROLLOUT), generation),
         )
-        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, config.n_teams)
-        played = self._play(teams, seeds, how)
+        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, teams.count)
+        played = self._play(teams, seeds, how if n_marl else None)
         self._check_finite(played, f"generation {generation + 1}")
-        replay = programs.store(replay, played.episodes, np.int32(config.n_teams))
+        if replay.capacity:
+            replay = programs.store(replay, played.episodes, np.int32(teams.count))
         returns = np.asarray(played.episode_return, np.float64)
         return replay, Generation(returns, int(np.sum(played.episodes.length)))
 

@@ -62,15 +62,16 @@ class TransitionRollouts:
         longest = learner.random_steps + self._config.env_steps
         longest += teams * self._task.spec.episode_limit
         capacity = min(learner.replay_capacity, max(longest, programs.INSERT_ROWS))
+        capacity *= self._config.has_marl
         return init_replay(empty_transition(self._task.spec), capacity)
 
     def warm_up(
         self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
     ) -> tuple[Replay, int] | None:
-        """Uniform actions, exactly as many steps as asked for."""
+        """Uniform actions, exactly as many steps as asked for; none where nothing learns."""
         config, spec = self._config, self._task.spec
         collected, index = 0, 0
-        while collected < config.learner.random_steps:
+        while config.has_marl and collected < config.learner.random_steps:
             if interrupted():
                 return None
             report(collected)
@@ -95,21 +96,23 @@ class TransitionRollouts:
         return replay, collected
 
     def play(
-        self, teams: Teams, generation: int, env_steps: int, replay: Replay
+        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
     ) -> tuple[Replay, Generation]:
         """The MARL team's actions are noisy; the population explores by its diversity."""
         config, spec = self._config, self._task.spec
-        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, config.n_teams + 1)
+        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, teams.count + 1)
         noise = np.random.default_rng(int(seeds[-1]))
-        shape, scale = spec.joint_action_size, np.float32(config.learner.exploration_noise)
+        scale = np.float32(config.learner.exploration_noise)
+        shape, first = (n_marl, spec.joint_action_size), teams.count - n_marl
 
         def choose(states: NDArray[np.float32], _: int) -> NDArray[np.float32]:
             actions = np.array(programs.act(teams, states, spec=spec, base=str(config.base)))
-            actions[-1] += scale * noise.standard_normal(shape, np.float32)
+            actions[first:] += scale * noise.standard_normal(shape, np.float32)
             return actions
 
         rollout = collect(self._pool, choose, seeds[:-1])
-        replay = store(replay, rollout.transitions)
+        if replay.capacity:
+            replay = store(replay, rollout.transitions)
         return replay, Generation(rollout.episode_return, len(rollout.transitions.reward))
 
     def test(

@@ -26,7 +26,10 @@ DIGITS = 6
 """Significant digits of numbers that are not whole; a test return's noise is in its third."""
 
 # Of a generation's row: what is the newest value, not a mean over generations.
-_LAST = ("kind", "generation", "env_steps", "gradient_steps", "wall_seconds", "injection/", "env/")
+_LAST = (
+    *("kind", "generation", "env_steps", "gradient_steps", "wall_seconds"),
+    *("injection/", "operators/", "env/"),
+)
 _DAMAGES = (ValueError, KeyError, TypeError, EOFError, IndexError, StopIteration, zlib.error)
 # Of a run's origin: the versions that may change numbers.
 _ORIGIN = (
@@ -115,7 +118,8 @@ def _packed(run: Recorded) -> dict[str, Any]:
     tables = {}
     for kind in sorted({str(row.get("kind")) for row in rows}):
         of_kind = [row for row in rows if str(row.get("kind")) == kind]
-        names = sorted({name for row in of_kind for name in row} - {"kind"})
+        # Lineage is of every generation or of no use.
+        names = sorted({name for row in of_kind for name in row} - {"kind", "teams"})
         columns = {name: [_short(row.get(name)) for row in of_kind] for name in names}
         tables[kind] = columns
     origin = {name: run.metadata[name] for name in _ORIGIN if name in run.metadata}

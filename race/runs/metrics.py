@@ -230,7 +230,7 @@ def check_extent(path: Path, content: bytes, kept: Extent) -> None:
     if len(content) < kept.offset:
         raise RunDirectoryError(
             f"The metrics file {path} has {len(content)} bytes, but the checkpoint was written "
-            f"when it had {kept.offset}: rows are missing. {advice}"
+            f"when it had {kept.offset}: rows are missing, or it belongs to another run. {advice}"
         )
     begin = content[: kept.offset]
     if begin and not begin.endswith(b"\n"):

@@ -5,6 +5,7 @@ import hashlib
 import json
 from typing import Any, NamedTuple
 
+from race.config.effects import NETWORKS
 from race.config.settings import Config
 
 
@@ -46,6 +47,10 @@ def settings(config: Config) -> dict[str, Any]:
         del kept["learner"]
     elif config.base != "facmac":
         del kept["facmac"]
+    if not config.has_marl:
+        for group, used in NETWORKS.items():
+            if group in kept:
+                kept[group] = {name: kept[group][name] for name in used}
     return {
         f"{group}.{name}" if isinstance(values, dict) else group: value
         for group, values in kept.items()

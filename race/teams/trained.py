@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike, NDArray
 
 from race.algorithms import algorithm_of
-from race.algorithms.base import Teams, tested_teams
+from race.algorithms.base import Teams
 from race.config.settings import Config, TeamName
 from race.envs import contract, make_task
 from race.envs.description import refuse_changed
@@ -34,8 +34,8 @@ class Trained(NamedTuple):
     config: Config
     task: AnyTask
     progress: Progress
-    encoder: Any
-    heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and, with a population, "champion"
+    encoders: dict[str, Any]  # by team, which may share them
+    heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and "champion", as far as there are such
 
     def resolve(self, team: TeamName) -> str:
         """``marl`` or ``champion``: what ``selected`` stands for by the training returns.
@@ -45,9 +45,11 @@ class Trained(NamedTuple):
         """
         name = self.progress.selected if team == "selected" else team
         if name not in self.heads:
+            (only,) = self.heads
+            lacks = "population and so no champion" if only == "marl" else "MARL team"
             raise ConfigError(
-                f"A run of {self.config.method} has no population and so no champion; ask for "
-                "--team marl or --team selected, which are the same there."
+                f"A run of {self.config.method} has no {lacks}; ask for --team {only} or --team "
+                "selected, which are the same there."
             )
         return name
 
@@ -65,7 +67,8 @@ class Trained(NamedTuple):
                 f"{self.config.task} has discrete actions, and its teams remember: they are "
                 "played by recurrent_policy."
             )
-        teams = Teams(self.encoder, self.heads[self.resolve(team)][None])
+        name = self.resolve(team)
+        teams = Teams(self.encoders[name], self.heads[name][None])
         spec, base = self.task.spec, str(self.config.base)
 
         def joint_action(state: ArrayLike) -> NDArray[np.float32]:
@@ -83,8 +86,8 @@ class Trained(NamedTuple):
         """
         if not isinstance(self.task, DiscreteTask):
             raise ConfigError(f"{self.config.task} has continuous actions: call policy instead.")
-        head = self.heads[self.resolve(team)]
-        return RecurrentPolicy(Teams(self.encoder, head[None]), self.task.spec)
+        name = self.resolve(team)
+        return RecurrentPolicy(Teams(self.encoders[name], self.heads[name][None]), self.task.spec)
 
 
 @final
@@ -152,5 +155,7 @@ def load_trained(path: Path) -> Trained:
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     refuse_changed(run_directory.recorded_task(path), task)
     state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
-    encoder, heads = tested_teams(algorithm, state, task.spec, config.has_population)
-    return Trained(config, task, progress_of(saved), encoder, heads)
+    groups = algorithm.tested(state, task.spec)
+    encoders = {name: group.encoder for group in groups for name in group.heads}
+    heads = {name: head for group in groups for name, head in group.heads.items()}
+    return Trained(config, task, progress_of(saved), encoders, heads)

@@ -12,14 +12,15 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from race import programs
-from race.algorithms.base import tested_teams
+from race.config.settings import Config
 from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Layout
 from race.replay.packing import layouts
+from race.rollouts.base import Score
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, counted, stamped
-from race.training.run_state import RunState
+from race.training.run_state import Progress, RunState
 
 CHUNK = 100
 """Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
@@ -59,7 +60,7 @@ def advance(run: Run, state: RunState) -> RunState:
         jax.block_until_ready(state.replay)
         run.clock.rolled_out()
         return state
-    if _owed(run, state) > 0:
+    if owed(run.config, state.progress) > 0:
         return learn(run, state)  # 8, 10, 13
     state = inject(run, state)  # 11
     return test(run, state) if _test_due(run, state) else state
@@ -70,7 +71,10 @@ def inject(run: Run, state: RunState) -> RunState:
     key = jax.random.fold_in(
         root_key(run.config.seed, Purpose.INJECTION), state.progress.generation
     )
-    algorithm = run.algorithm.inject(state.algorithm, key, state.hyper)
+    algorithm = state.algorithm
+    if state.progress.fitness and run.config.has_marl:
+        statics = {name: run.statics[name] for name in ("algorithm", "shape")}
+        algorithm = programs.inject(algorithm, key, hyper=state.hyper, **statics)
     progress = stamped(run, state.progress.but(learning=False))
     row = generation_row(run.config, run.algorithm, algorithm, state.losses, progress)
     run.metrics.write(row)
@@ -93,19 +97,27 @@ def roll_out(run: Run, state: RunState) -> RunState:
         DivergenceError: if a fitness or an action is not a finite number.
         TaskError: if an environment fails, or hands over what it may not.
     """
-    progress = state.progress
+    progress, config = state.progress, run.config
     run.report("rollouts", progress, {})
-    teams = run.algorithm.teams(state.algorithm, run.task.spec)
-    replay, played = run.rollouts.play(teams, progress.generation, progress.env_steps, state.replay)
+    teams = run.algorithm.teams(state.algorithm, run.task.spec, run.statics["shape"])
+    n_marl = config.n_marl_teams
+    if progress.env_steps - progress.random_steps < config.race.evolution_from and n_marl:
+        teams = teams.at(slice(teams.count - 1, None))  # of a population nobody plays yet
+    if n_marl:
+        teams = teams.last_again(n_marl)
+    replay, played = run.rollouts.play(
+        teams, n_marl, progress.generation, progress.env_steps, state.replay
+    )
     returns = played.episode_return.tolist()
+    fitness, of_marl = returns[: teams.count - n_marl], returns[teams.count - n_marl :]
     progress = progress.but(
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
         episodes=progress.episodes + len(returns),
         gradient_steps_before=progress.gradient_steps,
         generation=progress.generation + 1,
-        fitness=tuple(returns[:-1]),
-        marl_return=returns[-1],
+        fitness=tuple(fitness),
+        marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
         learning=True,
     )
     return state._replace(replay=replay, progress=counted(run, progress))
@@ -113,7 +125,7 @@ def roll_out(run: Run, state: RunState) -> RunState:
 
 def evolve(run: Run, state: RunState) -> RunState:
     """Line 9: the population evolves by the fitness just measured."""
-    if not run.config.has_population:
+    if not state.progress.fitness:
         return state
     fitness = jnp.asarray(state.progress.fitness, jnp.float32)
     key = jax.random.fold_in(
@@ -136,7 +148,7 @@ def learn(run: Run, state: RunState) -> RunState:
         # resumed run parts them alike.
         count, laid = _minibatches(run, state, key)
     else:
-        count, laid = min(CHUNK, _owed(run, state)), None
+        count, laid = min(CHUNK, owed(run.config, state.progress)), None
     algorithm, losses = programs.learn(
         state.algorithm,
         state.losses,
@@ -169,21 +181,24 @@ def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Lay
     """The next gradient steps on episodes: how many, and how their minibatches are laid out."""
     config = run.config
     room = max(EPISODES_CHUNK, config.n_teams)
-    count = min(room, _owed(run, state))
+    count = min(room, owed(run.config, state.progress))
     first, shape = np.int32(state.progress.gradient_steps), run.statics["shape"]
     drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, shape=shape)
     places, lengths = (np.asarray(column)[:count] for column in drawn)
     return count, layouts(places, lengths, run.task.spec.episode_limit, room)
 
 
-def _owed(run: Run, state: RunState) -> int:
-    progress, config = state.progress, run.config
+def owed(config: Config, progress: Progress) -> int:
+    """Gradient steps that are due."""
+    if not config.has_marl:
+        return 0
     if config.discrete:
         # From the first full minibatch on.
         learned_from = max(progress.episodes - config.facmac.batch_size + 1, 0)
         due = math.floor(learned_from * config.facmac.gradient_steps_per_episode)
     else:
-        learned_from = progress.env_steps - progress.random_steps
+        random = 0 if config.learner.random_steps_owed else progress.random_steps
+        learned_from = progress.env_steps - random
         due = math.floor(learned_from * config.learner.gradient_steps_per_env_step)
     return due - progress.gradient_steps
 
@@ -194,9 +209,10 @@ def test(run: Run, state: RunState) -> RunState:
     run.report("evaluation", progress, {})
     spec, episodes = run.task.spec, config.evaluation.episodes
     assert episodes is not None
-    encoder, tested = tested_teams(run.algorithm, state.algorithm, spec, config.has_population)
     seeds = host_seeds(config.seed, Purpose.EVALUATION, progress.generation, episodes)
-    scores = run.rollouts.test(encoder, tested, seeds)
+    scores: dict[str, Score] = {}
+    for encoder, heads in run.algorithm.tested(state.algorithm, spec):
+        scores |= run.rollouts.test(encoder, heads, seeds)
     progress = counted(run, stamped(run, progress.but(evaluated_at=progress.env_steps)))
     row = evaluation_row(progress, scores)
     run.metrics.write(row)

@@ -7,6 +7,7 @@ import numpy as np
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses
+from race.algorithms.lineage import OPERATORS, rows
 from race.config.settings import Config
 from race.rollouts.base import Score
 from race.training.run_state import Progress
@@ -15,23 +16,34 @@ from race.training.run_state import Progress
 def generation_row(
     config: Config, algorithm: Algorithm, learned: Any, losses: Losses, progress: Progress
 ) -> dict[str, Any]:
-    """What a generation did: fitness, fate of injected teams, mean losses, speed.
+    """What a generation did: fitness, fate of injected teams, lineage, mean losses, speed.
 
     Returns are those of training: the MARL team explores in them. Rates are those of the whole
-    run so far; they are None before the first injected team has met its fate.
+    run so far; they are None before the first injected team has met its fate, or the first child
+    of an operator has played. ``teams`` tells of each team of the population where it came from.
     """
     steps = progress.gradient_steps - progress.gradient_steps_before
     delay = config.policy_delay
     policy_steps = progress.gradient_steps // delay - progress.gradient_steps_before // delay
     row: dict[str, Any] = {"kind": "generation", **_counters(progress)}
-    row["marl/return"] = progress.marl_return
+    if progress.marl_return is not None:
+        row["marl/return"] = progress.marl_return
     if progress.fitness:
         row["population/fitness_max"] = max(progress.fitness)
         row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
         row["population/fitness_min"] = min(progress.fitness)
-        fates = np.asarray(algorithm.injection_counts(learned)).tolist()
-        for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
-            row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
+    population = algorithm.population(learned)
+    if population is not None:
+        if config.has_marl:
+            fates = np.asarray(population.injection_counts).tolist()
+            for name, count in zip(("elite", "parent", "discarded"), fates, strict=True):
+                row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
+        record = population.record
+        counts = (np.asarray(column).tolist() for column in (record.children, record.better))
+        for name, children, better in zip(OPERATORS, *counts, strict=True):
+            row[f"operators/{name}_better_rate"] = better / children if children else None
+        if progress.fitness:
+            row["teams"] = rows(record.played, progress.fitness)
     for name, total in losses.items():
         count = policy_steps if name in algorithm.policy_losses else steps
         row[f"loss/{name}"] = float(total) / count if count else None

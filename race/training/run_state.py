@@ -37,8 +37,9 @@ class Progress:
     """Environment steps before the current generation."""
     fitness: tuple[float, ...] = ()
     """Training returns of the population in the newest generation; empty without one."""
-    marl_return: float = 0.0
-    """Training return of the MARL team in the newest generation."""
+    marl_return: float | None = 0.0
+    """Training return of the MARL team in the newest generation, the mean of its episodes; None
+    where there is no such team."""
     evaluated_at: int = 0
     """``env_steps`` of the newest evaluation."""
     wall_seconds: float = 0.0
@@ -55,6 +56,8 @@ class Progress:
     @property
     def selected(self) -> str:
         """Of the MARL team and the champion, the one with the better training return."""
+        if self.marl_return is None:
+            return "champion"
         return "champion" if self.fitness and max(self.fitness) > self.marl_return else "marl"
 
     @property
@@ -90,7 +93,7 @@ def fresh(config: Config, spec: Spec, algorithm: Algorithm, replay: Replay) -> R
     """The state before the first step, with an empty buffer."""
     key = root_key(config.seed, Purpose.INIT)
     return RunState(
-        algorithm=copy(start(key, **statics(config, spec, algorithm))),
+        algorithm=copy(start(key, hyper=hyper_of(config), **statics(config, spec, algorithm))),
         losses=empty_losses(algorithm),
         replay=replay,
         progress=Progress(),

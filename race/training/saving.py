@@ -1,6 +1,7 @@
 """How a run's state gets to disk and back; `race.training.trainer` alone decides when."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -71,8 +72,8 @@ def _contents(
 
 def _segment_rows(replay: Replay) -> int:
     """Items of a file of a checkpoint: of transitions many, of episodes about 64 MB."""
-    item = sum(leaf.nbytes // leaf.shape[0] for leaf in jax.tree.leaves(replay.data))
-    return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // item))
+    item = sum(leaf.nbytes for leaf in jax.tree.leaves(replay.data)) // max(replay.capacity, 1)
+    return min(SEGMENT_ROWS, max(1, SEGMENT_BYTES // max(item, 1)))
 
 
 def check_version(began_with: Any) -> None:
@@ -139,11 +140,33 @@ def learned_of(
     """
     key = root_key(config.seed, Purpose.INIT)
     template = {
-        "algorithm": start(key, **statics(config, spec, algorithm)),
+        "algorithm": start(key, hyper=hyper_of(config), **statics(config, spec, algorithm)),
         "losses": empty_losses(algorithm),
     }
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
-    return copy(restore(template, saved.arrays))
+    return copy(restore(template, _as_now(saved.arrays, template)))
+
+
+# Arrays of a population, by the names they had before it was a part of its own.
+_BEFORE = ("heads", "elite", "worst", "injected", "injection_counts")
+
+
+def _as_now(arrays: Mapping[str, Any], template: Any) -> dict[str, Any]:
+    """Arrays of a checkpoint, also of one from before populations kept a record of their teams."""
+    old = {name: f"['algorithm'].{name}" for name in _BEFORE}
+    if old["heads"] not in arrays:
+        return dict(arrays)
+    now = {name: f"['algorithm'].population.{name}" for name in _BEFORE}
+    now["heads"] = "['algorithm'].population.teams.heads"
+    renamed = {old[name]: now[name] for name in _BEFORE}
+    found = {renamed.get(name, name): value for name, value in arrays.items()}
+    found["['algorithm'].population.champion.heads"] = arrays[old["heads"]][arrays[old["elite"]]]
+    missing = {
+        name: value
+        for name, value in flatten(template).items()
+        if name.startswith("['algorithm'].population.record")
+    }
+    return missing | found
 
 
 def progress_of(saved: Checkpoint) -> Progress:

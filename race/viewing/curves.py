@@ -94,10 +94,10 @@ def keys(metric: str, team: str, config: Config) -> dict[str, str]:
     """Keys of the rows to draw, by the label that tells a method's curves apart."""
     if "/" in metric or metric in ("wall_seconds", "gradient_steps"):
         return {"": metric}
-    if team == "all" and config.has_population:
+    if not (config.has_population and config.has_marl):  # there is one team, whatever the choice
+        return {"": f"eval/{'marl' if config.has_marl else 'champion'}/{metric}"}
+    if team == "all":
         return {LABELS[name]: f"eval/{name}/{metric}" for name in TEAMS}
-    if not config.has_population:  # there is the MARL team alone, whatever the choice
-        return {"": f"eval/marl/{metric}"}
     return {"" if team == "selected" else LABELS[team]: f"eval/{team}/{metric}"}
 
 

@@ -27,9 +27,15 @@ _COLOURS = {
     "MADDPG": "#1f77b4",
     "RACE(FACMAC)": "#e377c2",
     "FACMAC": "#8c564b",
+    "MERL(MATD3)": "#1f77b4",
+    "MERL(FACMAC)": "#1f77b4",
+    "EA": "#2ca02c",
 }
 # Where discrete actions leave only these two, they have the colours of the paper's other figure.
-_DISCRETE_COLOURS = {"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"}
+_DISCRETE_COLOURS = {
+    **{"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"},
+    **{"MERL(FACMAC)": "#1f77b4", "EA": "#2ca02c"},
+}
 _OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#17becf", "#bcbd22")
 _AXES = {"return_mean": "test return", "win_rate": "test win rate"}
 _LINES = {"selected": "-", "marl": "--", "champion": ":", "best": "-."}

@@ -9,14 +9,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from tiny_episodes import with_heads
 
-from race.algorithms import Algorithm, algorithm_of, marl, race
+from race.algorithms import Algorithm, algorithm_of, ea, marl, merl, race
 from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config, LearnerConfig
 from race.config.shape import shape_of
 from race.types import EnvSpec
 
-ALGORITHMS = {"race": race, "marl": marl}
+ALGORITHMS = {"race": race, "marl": marl, "merl": merl, "no-sharing": merl, "ea": ea}
+FAST = [
+    *(("race", "matd3"), ("race", "facmac"), ("marl", "matd3")),
+    *(("merl", "matd3"), ("ea", "matd3")),
+]
+SLOW = [
+    *(("race", "maddpg"), ("marl", "maddpg"), ("marl", "facmac")),
+    *(("merl", "maddpg"), ("merl", "facmac"), ("no-sharing", "matd3")),
+]
 
 
 class Case:
@@ -37,7 +46,7 @@ class Case:
         # Evolution knows no learner: one program serves all.
         matd3 = dataclasses.replace(config, base="matd3", learner=LearnerConfig())
         self.evolve = compiled(algorithm, "evolve", spec, matd3)
-        self.population = self.algorithm.teams(self.state, self.spec).heads.shape[0] - 1
+        self.population = config.n_teams - config.n_marl_teams
         self.fitness = jnp.arange(max(1, self.population), dtype=jnp.float32)
 
     @property
@@ -51,15 +60,21 @@ class Case:
         )
 
     def inject(self, state: Any) -> Any:
-        return self.algorithm.inject(state, jax.random.key(0), hyper_of(self.config))
+        shape, hyper = shape_of(self.config), hyper_of(self.config)
+        return self.algorithm.inject(state, jax.random.key(0), shape, hyper)
+
+    def heads(self, state: Any) -> Any:
+        """Those of all teams."""
+        return self.algorithm.teams(state, self.spec, shape_of(self.config)).heads
 
     def init(self, seed: int) -> Any:
-        return self.algorithm.init(jax.random.key(seed), self.spec, shape_of(self.config))
+        shape, hyper = shape_of(self.config), hyper_of(self.config)
+        return self.algorithm.init(jax.random.key(seed), self.spec, shape, hyper)
 
 
 @pytest.fixture(
     scope="module",
-    params=[(a, b) for a in ALGORITHMS for b in ("matd3", "maddpg", "facmac")],
+    params=[*FAST, *(pytest.param(names, marks=pytest.mark.slow) for names in SLOW)],
     ids="-".join,
 )
 def case(
@@ -85,9 +100,11 @@ def same(one: Any, two: Any) -> bool:
 
 
 def networks(case: Case, state: Any) -> dict[str, Any]:
-    """Critics, policies and targets of either algorithm's state."""
+    """Critics, policies and targets of any algorithm's state."""
     if case.algorithm is race:
         return {"critics": state.critics, "policies": state.policies, "target": state.target}
+    if case.algorithm is merl:
+        state = state.marl
     return {
         "critics": state.critic,
         "policies": (state.encoder, state.head),
@@ -124,15 +141,25 @@ def test_functions_keep_structure_shapes_and_types(case: Case) -> None:
 def test_teams_champion_and_counts(case: Case) -> None:
     population = case.config.race.population_size if case.config.has_population else 0
     assert case.population == population
-    heads = case.algorithm.teams(case.state, case.spec).heads
+    heads = case.heads(case.state)
     h1 = case.config.learner.hidden_sizes[1] + 1
-    assert heads.shape == (population + 1, case.spec.n_agents, h1, case.spec.action_size)
-    assert case.algorithm.champion(case.state).shape == heads.shape[1:]
-    assert np.asarray(case.algorithm.injection_counts(case.state)).tolist() == [0, 0, 0]
+    count = population + case.config.has_marl
+    assert heads.shape == (count, case.spec.n_agents, h1, case.spec.action_size)
+    tested = {
+        n: h for g in case.algorithm.tested(case.state, case.spec) for n, h in g.heads.items()
+    }
+    assert ("marl" in tested) == case.config.has_marl
+    assert ("champion" in tested) == case.config.has_population
+    assert all(team.shape == heads.shape[1:] for team in tested.values())
+    assert (case.algorithm.population(case.state) is not None) == case.config.has_population
 
 
 def test_fresh_targets_equal_the_networks_and_no_two_teams_are_alike(case: Case) -> None:
-    state = case.state
+    heads = case.heads(case.state)
+    assert len(np.unique(heads[:, 0, 0, 0])) == len(heads)
+    if case.algorithm is ea:
+        return
+    state = case.state.marl if case.algorithm is merl else case.state
     trained = state.policies if case.algorithm is race else state
     assert_equal(state.target.encoder, trained.encoder.params)
     assert_equal(state.target.head, trained.head.params)
@@ -140,8 +167,6 @@ def test_fresh_targets_equal_the_networks_and_no_two_teams_are_alike(case: Case)
     assert_equal(state.target.critic, critic.params)
     if case.algorithm is race:
         assert_equal(state.target.pevfa, state.critics.pevfa.params)
-    heads = case.algorithm.teams(state, case.spec).heads
-    assert len(np.unique(heads[:, 0, 0, 0])) == len(heads)
 
 
 def test_the_same_key_gives_the_same_and_another_key_another(case: Case) -> None:
@@ -153,12 +178,15 @@ def test_the_same_key_gives_the_same_and_another_key_another(case: Case) -> None
     assert_equal(one, two)
     if case.algorithm is race:
         assert not same(one, other)
+    if case.config.has_population:
         a, b, c = (case.evolve(case.state, case.fitness, jax.random.key(k)) for k in (0, 0, 1))
         assert_equal(a, b)
         assert not same(a, c)
 
 
 def test_policies_and_targets_wait_for_the_delay(case: Case) -> None:
+    if not case.config.has_marl:
+        pytest.skip("nothing is learned by gradients")
     delay = case.config.learner.policy_delay
     assert delay == (2 if case.config.base == "matd3" else 1)
     state = case.state
@@ -180,15 +208,13 @@ def test_a_step_traces_once(case: Case, batch_of: Callable[..., Any]) -> None:
         state, *_ = case.update(
             state, batch_of(case.spec, 3, step), jnp.int32(step), jax.random.key(step)
         )
-        if case.algorithm is race and step % 2:
+        if case.config.has_population and step % 2:
             state = case.inject(case.evolve(state, case.fitness, jax.random.key(step)))
         sizes.append(case.update._cache_size())
     assert sizes == sizes[:1] * 6
 
 
 def test_seeds_are_a_leading_axis(case: Case, batch_of: Callable[..., Any]) -> None:
-    if case.config.base == "maddpg":
-        pytest.skip("the same code as MATD3's")
     states = [case.init(seed) for seed in (1, 2)]
     batches = [batch_of(case.spec, 3, seed) for seed in (1, 2)]
     keys = jax.random.split(jax.random.key(0))
@@ -268,15 +294,17 @@ def with_junk_in_padding(case: Case) -> Any:
         critic=state.critics.critic._replace(params=spoil_critic(state.critics.critic.params)),
         pevfa=state.critics.pevfa._replace(params=spoil_pevfa(state.critics.pevfa.params)),
     )
-    return state._replace(
+    spoiled = state._replace(
         target=target._replace(pevfa=spoil_pevfa(target.pevfa)),
         critics=critics,
         policies=spoil(state.policies),
-        heads=jnp.where(jnp.asarray(columns)[None], 1e3, state.heads),
     )
+    return with_heads(spoiled, jnp.where(jnp.asarray(columns)[None], 1e3, state.heads))
 
 
 def test_padding_changes_no_loss_and_no_other_parameter(case: Case) -> None:
+    if case.config.whole_teams:
+        pytest.skip("the learner is that without a population")
     clean, *losses = case.update(case.state, case.batch, jnp.int32(1), jax.random.key(0))
     spoiled, *spoiled_losses = case.update(
         with_junk_in_padding(case), case.batch, jnp.int32(1), jax.random.key(0)
@@ -295,7 +323,7 @@ def test_padded_columns_stay_zero(case: Case, batch_of: Callable[..., Any]) -> N
             state, batch_of(case.spec, 3, step), jnp.int32(step), jax.random.key(step)
         )
         state = case.inject(case.evolve(state, case.fitness, jax.random.key(step)))
-    heads = np.asarray(case.algorithm.teams(state, case.spec).heads)
+    heads = np.asarray(case.heads(state))
     padded = ~np.broadcast_to(np.asarray(case.spec.action_mask)[:, None], heads.shape)
     assert (heads[padded] == 0).all()
     assert (heads[~padded] != 0).all()
@@ -315,7 +343,7 @@ def race_case(
 
 
 def test_all_teams_act_over_the_same_encoders_and_the_marl_team_is_last(race_case: Case) -> None:
-    teams = race.teams(race_case.state, race_case.spec)
+    teams = race.teams(race_case.state, race_case.spec, shape_of(race_case.config))
     assert_equal(teams.encoder, race_case.state.policies.encoder.params)
     assert_equal(teams.heads[:-1], race_case.state.heads)
     assert_equal(teams.heads[-1], race_case.state.policies.head.params)
@@ -328,8 +356,8 @@ def test_evolution_touches_the_population_alone_and_never_its_elite(race_case: C
         after = race_case.evolve(state, jnp.asarray(fitness), jax.random.key(seed))
         elite = int(fitness.argmax())
         assert_equal(after.heads[elite], state.heads[elite])
-        assert_equal(race.champion(after), state.heads[elite])
-        assert int(after.worst) == fitness.argmin()
+        assert_equal(after.population.champion.heads, state.heads[elite])
+        assert int(after.population.worst) == fitness.argmin()
         # Those that did not reproduce are gone, the worst of them too.
         for loser in np.argsort(fitness)[:3]:
             assert not np.array_equal(after.heads[loser], state.heads[loser])
@@ -350,7 +378,7 @@ def test_the_next_population_is_elite_parent_copy_offspring_and_marl_team(
     elite, parent, copy, offspring, marl = (np.asarray(after.heads[team]) for team in ranked)
     np.testing.assert_array_equal(elite, state.heads[3])
     np.testing.assert_array_equal(marl, state.policies.head.params)
-    assert int(after.injected) == 1
+    assert int(after.population.injected) == 1
     if probability == 0:
         np.testing.assert_array_equal(parent, state.heads[0])
         np.testing.assert_array_equal(copy, elite)
@@ -371,8 +399,8 @@ def test_injection_replaces_the_worst_alone(race_case: Case) -> None:
     for team in range(5):
         expected = state.policies.head.params if team == 1 else state.heads[team]
         assert_equal(after.heads[team], expected)
-    assert int(after.injected) == 1
-    assert_equal(race.champion(after), race.champion(state))
+    assert int(after.population.injected) == 1
+    assert_equal(after.population.champion, state.population.champion)
     assert_equal(after.policies, state.policies)
 
 
@@ -380,37 +408,37 @@ def test_fates_of_the_injected_team(race_case: Case) -> None:
     """Scripted: where the injected team stands decides what is counted."""
 
     def counts(state: Any) -> list[int]:
-        return np.asarray(race.injection_counts(state)).tolist()
+        return np.asarray(state.population.injection_counts).tolist()
 
     def generation(state: Any, place_of_injected: int | None) -> Any:
         """Evolves on a fitness that ranks the injected team at this place, then injects."""
-        others = [t for t in range(5) if t != int(state.injected)]
+        others = [t for t in range(5) if t != int(state.population.injected)]
         if place_of_injected is not None:
-            others.insert(place_of_injected, int(state.injected))
+            others.insert(place_of_injected, int(state.population.injected))
         fitness = np.zeros(5, np.float32)
         fitness[others] = -np.arange(5)
         evolved = race_case.evolve(
             state, jnp.asarray(fitness), jax.random.key(place_of_injected or 0)
         )
-        assert int(evolved.elite) == others[0]
+        assert int(evolved.population.elite) == others[0]
         return race_case.inject(evolved)
 
     state = race_case.state
-    assert int(state.injected) == -1
+    assert int(state.population.injected) == -1
     state = generation(state, None)
     assert counts(state) == [0, 0, 0]  # nobody had been injected yet
     script = [(0, [1, 0, 0]), (1, [1, 1, 0]), (2, [1, 1, 1]), (4, [1, 1, 2]), (0, [2, 1, 2])]
     for place, expected in script:
         state = generation(state, place)
         assert counts(state) == expected
-    assert int(state.injected) != int(state.elite)
+    assert int(state.population.injected) != int(state.population.elite)
 
 
 def test_evolution_survives_fitness_that_is_not_a_number(race_case: Case) -> None:
     state = race_case.evolve(race_case.state, jnp.full(5, jnp.nan), jax.random.key(0))
-    assert int(state.elite) != int(state.worst)
+    assert int(state.population.elite) != int(state.population.worst)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(state.heads))
     state = race_case.evolve(
         race_case.state, jnp.array([jnp.nan, -3.0, -jnp.inf, jnp.nan, -5.0]), jax.random.key(0)
     )
-    assert int(state.elite) == 1
+    assert int(state.population.elite) == 1

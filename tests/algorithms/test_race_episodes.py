@@ -98,8 +98,7 @@ def explained(config: Config, batch: Laid) -> Explained:
             fitting.append((team, *y))
     ((team, y_marl, y_team),) = fitting
     critic = float64(got.after.critics.critic.params)
-    # The MARL team's are drawn twice, for its head and for the encoder, and are the same.
-    first, second = {noise.tobytes(): noise for noise in got.draws.noise}.values()
+    first, second = got.draws.noise
     orders = []
     for own, other in ((first, second), (second, first)):
         marl_s = sampled(policies.encoder, policies.head, episodes, of_steps(batch, own))

@@ -29,6 +29,7 @@ from tiny_episodes import (
 from race.algorithms import race
 from race.config.hyper import hyper_of
 from race.config.settings import Config
+from race.config.shape import shape_of
 from race.replay.buffer import Layout, Replay, slots_of
 
 PLAIN = ("critic", "pevfa", "value", "policy", "vfm")
@@ -155,7 +156,8 @@ def test_targets_are_copied_after_every_so_many_steps(
 
 
 def test_all_teams_act_with_a_head_for_every_agent(before: Any, config: Config) -> None:
-    encoder, heads = race.teams(before, SPEC)
+    teams = race.teams(before, SPEC, shape_of(config))
+    encoder, heads = teams.encoder, teams.heads
     population = config.race.population_size
     assert heads.shape == (population + 1, N, H + 1, A)
     assert encoder is before.policies.encoder.params
@@ -167,9 +169,10 @@ def test_all_teams_act_with_a_head_for_every_agent(before: Any, config: Config) 
 def test_injection_gives_every_agent_of_the_worst_team_the_marl_head(
     before: Any, config: Config
 ) -> None:
-    state = before._replace(worst=jnp.int32(2), elite=jnp.int32(0))
-    after = race.inject(state, jax.random.key(0), hyper_of(config))
-    assert int(after.injected) == 2
+    roles = before.population._replace(worst=jnp.int32(2), elite=jnp.int32(0))
+    state = before._replace(population=roles)
+    after = race.inject(state, jax.random.key(0), shape_of(config), hyper_of(config))
+    assert int(after.population.injected) == 2
     for agent in range(N):
         assert jnp.array_equal(after.heads[2, agent], before.policies.head.params[0])
     kept = jnp.array([0, 1, 3])
@@ -190,7 +193,7 @@ def test_evolution_moves_every_agents_every_action(
     after = compiled(race, "evolve", SPEC, config)(before, fitness, jax.random.key(0))
     assert after.heads.shape == before.heads.shape
     assert jnp.array_equal(after.heads[1], before.heads[1])
-    assert (int(after.elite), int(after.worst)) == (1, 0)
+    assert (int(after.population.elite), int(after.population.worst)) == (1, 0)
     others = jnp.array([0, 2, 3])
     assert (after.heads[others, :, :-1] != before.heads[others, :, :-1]).all()
     # The tournament is among all: the parent is team 3.

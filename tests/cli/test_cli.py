@@ -212,7 +212,7 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     battle = tasks["micro/MMM2"]
     sizes = ("agents", "enemies", "actions", "obs", "state", "limit", "alpha", "beta")
     assert [battle[size] for size in sizes] == [10, 12, 18, 176, 322, 180, 0.01, 1e-2]
-    assert set(listing["algorithms"]) == {"race", "matd3", "maddpg", "facmac"}
+    assert set(listing["algorithms"]) == {"race", "merl", "ea", "matd3", "maddpg", "facmac"}
     assert "vmm-only" in listing["ablations"]
     race("list")
     table = capsys.readouterr().out

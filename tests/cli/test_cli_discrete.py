@@ -205,7 +205,7 @@ def test_a_battle_of_a_run_is_drawn(battle: Path, capsys: pytest.CaptureFixture[
     trained = load_trained(battle)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
         heads = {"champion": trained.heads["champion"]}
-        score = rollouts.test(trained.encoder, heads, np.array([7]))["champion"]
+        score = rollouts.test(trained.encoders["champion"], heads, np.array([7]))["champion"]
     steps, worth = int(score.lengths[0]), float(score.returns[0])
     capsys.readouterr()
     race(f"render {battle} --team champion --seed 7 --seconds 0 --out whole.gif")
@@ -308,7 +308,7 @@ def test_a_trained_team_plays_in_python(run_of: Any) -> None:
     trained = load_trained(path)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
         head = trained.heads["marl"]
-        expected = [rollouts.episode(trained.encoder, head, seed) for seed in (3, 4, 5)]
+        expected = [rollouts.episode(trained.encoders["marl"], head, seed) for seed in (3, 4, 5)]
     policy = trained.recurrent_policy("selected")
     env = trained.task.make(None)
     for seed, actions in zip((3, 4, 5), expected, strict=True):
@@ -341,6 +341,8 @@ OUT_OF_RANGE = {
     "batch-size": ("1", "16385"),
     "actor-learning-rate": ("0", "-1", "nan", "inf"),
     "critic-learning-rate": ("0", "-1", "nan", "inf"),
+    "encoder-learning-rate": ("0", "-1", "nan", "inf"),
+    "last-layer-scale": ("0", "-1", "nan", "inf"),
     "gradient-clip": ("0", "nan", "inf"),
     "discount": ("1", "-0.1", "nan"),
     "td-lambda": ("-0.1", "1.1", "nan"),

@@ -12,21 +12,29 @@ from race.config.settings import Config, EnvConfig, FacmacConfig, LearnerConfig,
 from race.config.shape import shape_of
 from race.errors import ConfigError
 
-METHODS = [
-    *((algo, base, False) for algo, base in (("race", "matd3"), ("race", "maddpg"))),
-    *(("race", "facmac", False), ("matd3", None, False), ("maddpg", None, False)),
-    *(("facmac", None, False), ("facmac", None, True), ("race", None, True)),
+METHODS: list[tuple[dict[str, Any], bool]] = [
+    *(({"algo": "race", "base": base}, False) for base in ("matd3", "maddpg", "facmac")),
+    *(({"algo": algo}, False) for algo in ("matd3", "maddpg", "facmac", "ea", "merl")),
+    *(({"algo": algo}, True) for algo in ("facmac", "race", "ea", "merl")),
+    ({"algo": "merl", "base": "facmac"}, False),
+    *(({"race": RaceConfig(evolution=name)}, True) for name in ("cem", "es", "own:operator")),
+    *(({"race": RaceConfig(sharing=False)}, discrete) for discrete in (False, True)),
 ]
 ON_HOST = {
-    False: {"exploration_noise", "replay_capacity", "random_steps", "gradient_steps_per_env_step"},
+    False: {
+        *("exploration_noise", "replay_capacity", "random_steps", "gradient_steps_per_env_step"),
+        "random_steps_owed",
+    },
     True: {
         *("replay_capacity", "replay_precision", "gradient_steps_per_episode"),
         *("epsilon_start", "epsilon_finish", "epsilon_steps"),
     },
 }
 OTHER: dict[str, Any] = {
-    **{"replay_precision": "float16", "mutation_draw": "weight"},
-    **{"mutation_fraction": 0.25, "vmm_weight": 0.03},
+    **{"replay_precision": "float16", "mutation_draw": "row"},
+    **{"mutation_fraction": 0.25, "vmm_weight": 0.03, "encoder_learning_rate": 0.02},
+    **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
+    **{"team_draw": "each", "evolution": "another:operator"},
 }
 SETTINGS = [
     (group, field.name)
@@ -54,25 +62,40 @@ def refused(config: Config, **facts: bool) -> str:
     return ""
 
 
-@pytest.mark.parametrize(("algo", "base", "discrete"), METHODS)
+def read_on_host(config: Config, group: str, name: str) -> bool:
+    """Settings that neither `Shape` nor `Hyper` shows."""
+    if group == "race":
+        beside = config.has_population and config.has_marl
+        return beside and name in ("marl_episodes", "evolution_from")
+    mine = group == ("facmac" if config.discrete else "learner")
+    return mine and (
+        (config.has_marl and name in ON_HOST[config.discrete]) or name == "replay_precision"
+    )
+
+
+@pytest.mark.parametrize(("method", "discrete"), METHODS)
 def test_a_setting_is_refused_exactly_if_nothing_reads_it(
-    algo: Any, base: Any, discrete: bool
+    method: dict[str, Any], discrete: bool
 ) -> None:
-    plain = Config("some-task", algo=algo, base=base)
+    plain = Config("some-task", **method)
     resolved = resolve(plain, discrete=discrete)
     assert refused(plain, discrete=discrete) == ""
     for group, name in SETTINGS:
         settings = getattr(plain, group)
         value = other(name, getattr(settings, name))
+        if name == "mutation_draw":  # methods differ in what they do where nothing is said
+            value = "row" if resolved.race.mutation_draw == "weight" else "weight"
         assert value != getattr(settings, name)
         changed = dataclasses.replace(
             plain, **{group: dataclasses.replace(settings, **{name: value})}
         )
-        new = resolve(changed, discrete=discrete)
+        try:
+            new = resolve(changed, discrete=discrete)
+        except ConfigError:  # refused as what it is
+            assert name == "shared_agents"
+            continue
         read = (shape_of(new), str(hyper_of(new))) != (shape_of(resolved), str(hyper_of(resolved)))
-        mine = group == ("facmac" if discrete else "learner")
-        read |= mine and name in ON_HOST[discrete]
-        read &= name != "value_size" or changed.has_population  # the state-value net is RACE's
+        read |= read_on_host(resolved, group, name)
         told = refused(changed, discrete=discrete)
         option = f"--{group}.{name.replace('_', '-')} would have no effect"
         assert (option in told) == (not read), (group, name, told)
@@ -105,6 +128,9 @@ def test_a_base_beside_another_algorithm_is_refused() -> None:
         Config("some-task", algo="matd3", base="maddpg")
     )
     assert refused(Config("some-task", algo="matd3", base="matd3")) == ""
+    assert "--base would have no effect with --algo ea" in refused(
+        Config("some-task", algo="ea", base="maddpg")
+    )
 
 
 def test_presets_are_no_wish_of_the_users() -> None:

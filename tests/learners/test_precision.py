@@ -33,9 +33,9 @@ def gradients() -> dict[str, Any]:
         Config(spec.task, facmac=FacmacConfig(hidden_size=16, utility_sizes=(16, 16))),
         discrete=True,
     )
-    state = race.init(jax.random.key(0), spec, shape_of(config))
+    state = race.init(jax.random.key(0), spec, shape_of(config), hyper_of(config))
     seeds = np.arange(EPISODES, dtype=np.uint32)
-    teams = race.teams(state, spec)
+    teams = race.teams(state, spec, shape_of(config))
     exact = play(device(), teams, seeds, None, spec, "float32").episodes
     places = np.arange(EPISODES)[None]
     laid = layouts(places, np.asarray(exact.length)[None], spec.episode_limit)

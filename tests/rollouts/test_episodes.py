@@ -381,7 +381,7 @@ def test_the_marl_team_alone_explores_in_training_less_and_less(on_device: bool)
         for env_steps in (0, 50, 100, 1000):
             replay = rollouts.empty_replay()
             for generation in range(30):
-                replay, _ = rollouts.play(certain(config, task), generation, env_steps, replay)
+                replay, _ = rollouts.play(certain(config, task), 1, generation, env_steps, replay)
             replay_of[env_steps] = replay
     shown = {}
     for env_steps, replay in replay_of.items():
@@ -406,7 +406,7 @@ def test_training_is_the_same_on_host_and_device(name: str) -> None:
         with EpisodeRollouts(config, task, on_device) as rollouts:
             replay, results = rollouts.empty_replay(), []
             for generation in range(3):
-                replay, result = rollouts.play(teams, generation, 0, replay)
+                replay, result = rollouts.play(teams, 1, generation, 0, replay)
                 results.append(result)
         found.append((replay, results))
     (replay, results), _ = found
@@ -535,7 +535,7 @@ def test_an_environment_that_fails_names_its_task(
         EpisodeRollouts(config_of("countdown"), task) as rollouts,
         pytest.raises(TaskError, match=told),
     ):
-        rollouts.play(teams_of(task.spec, 5), 0, 0, rollouts.empty_replay())
+        rollouts.play(teams_of(task.spec, 5), 1, 0, 0, rollouts.empty_replay())
     assert made
     assert all(env.closed for env in made)
 
@@ -547,10 +547,10 @@ def test_observations_too_large_for_the_buffer_are_refused(made: list[Countdown]
         with EpisodeRollouts(config, task) as rollouts:
             teams, replay = teams_of(task.spec, 5), rollouts.empty_replay()
             if fits:
-                assert int(rollouts.play(teams, 0, 0, replay)[0].inserted) == 5
+                assert int(rollouts.play(teams, 1, 0, 0, replay)[0].inserted) == 5
             else:
                 with pytest.raises(DivergenceError, match="replay-precision float16"):
-                    rollouts.play(teams, 0, 0, replay)
+                    rollouts.play(teams, 1, 0, 0, replay)
 
 
 @pytest.mark.parametrize(("n_actions", "dtype"), [(256, np.uint8), (257, np.uint16)])

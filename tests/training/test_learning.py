@@ -56,7 +56,7 @@ class Learned:
         self.config, self.spec = config, task.spec
         self.algorithm, self.learner = algorithm_of(config), learner_of(shape_of(config))
         fixed = statics(config, task.spec, self.algorithm)
-        state = programs.start(jax.random.key(0), **fixed)
+        state = programs.start(jax.random.key(0), hyper=hyper_of(config), **fixed)
         replay = store(init_replay(empty_transition(task.spec), max(len(data.reward), 2048)), data)
         sums = programs.empty_losses(self.algorithm)
         zero, count = np.int32(0), np.int32(steps)
@@ -71,11 +71,15 @@ class Learned:
             **fixed,
         )
 
+    def teams(self) -> Any:
+        return self.algorithm.teams(self.state, self.spec, shape_of(self.config))
+
     def act(self, states: np.ndarray) -> np.ndarray:
         """The MARL team's joint actions."""
         from race.networks.dense import act, encode
 
-        encoder, heads = self.algorithm.teams(self.state, self.spec)
+        teams = self.teams()
+        encoder, heads = teams.encoder, teams.heads
         return np.asarray(
             act(encode(encoder, self.spec, jnp.asarray(states)), heads[-1], self.spec)
         )
@@ -171,7 +175,7 @@ def test_value_flows_back_discounted(train: Train, algo: str, base: str) -> None
 def _team_action(learned: Learned, head: Any, states: np.ndarray) -> np.ndarray:
     from race.networks.dense import act, encode
 
-    encoder = learned.algorithm.teams(learned.state, learned.spec).encoder
+    encoder = learned.teams().encoder
     return np.asarray(act(encode(encoder, learned.spec, jnp.asarray(states)), head, learned.spec))
 
 

@@ -206,6 +206,7 @@ def test_each_program_is_compiled_once(tmp_path: Path) -> None:
         "act": 2,  # training, and evaluation with its own number of teams
         "evolve": 1,
         "learn": 1,
+        "inject": 1,
     }
 
 
