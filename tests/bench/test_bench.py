@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from race.bench import suite
+from race.bench import evolution, suite
 from race.bench.measurement import Measurement, Subject, interleaved_best
 from race.bench.products import (
     Product,
@@ -19,6 +19,8 @@ from race.bench.products import (
     run_products,
 )
 from race.cli.bench import main
+from race.config.presets import resolve
+from race.config.settings import Config, RaceConfig
 from race.errors import RaceError
 
 HLO = """\
@@ -137,3 +139,13 @@ def test_names_are_distinct_and_measurements_have_no_goal_unless_given() -> None
     names = [name for subject in suite.subjects() for name in subject.names]
     assert len(set(names)) == len(names)
     assert Measurement("x", 1.0, "s").met is None
+
+
+def test_evolution_is_measured_as_training_makes_it() -> None:
+    config = resolve(Config("probe/target", race=RaceConfig(population_size=8)))
+    evolved = evolution.Evolutions(config)
+    first, second = evolved(), evolved()
+    origins = [[team["origin"] for team in row["teams"]] for row in (first, second)]
+    assert origins[0] == ["initial"] * 8
+    assert origins[1].count("injected") == origins[1].count("elite") == 1
+    assert second["injection/discarded_rate"] is not None
