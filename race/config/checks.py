@@ -140,7 +140,13 @@ def check(config: Config) -> None:
             learner.gradient_steps_per_env_step,
             "in (0, 100]",
         ),
-        *_facmac_rules(facmac, config.n_teams),
+        (
+            1 <= race.marl_episodes <= LARGEST_LAYER,
+            "race.marl-episodes",
+            race.marl_episodes,
+            f"from 1 to {LARGEST_LAYER}",
+        ),
+        *_facmac_rules(facmac, config.n_teams * (config.discrete and config.has_marl)),
         (
             race.evolution in EVOLUTIONS or ":" in race.evolution,
             "race.evolution",
@@ -163,6 +169,8 @@ def check(config: Config) -> None:
             learner.shared_agents,
             "False where whole teams evolve: each of their agents has an encoder of its own",
         ),
+        (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
+        *_population_rules(race),
         (
             config.whole_teams or race.vfm_marl_weight + race.vfm_team_weight + race.vmm_weight > 0,
             "race.vmm-weight",
@@ -170,9 +178,6 @@ def check(config: Config) -> None:
             "above 0 where the weights of both terms of Eq. (2) are 0, since encoders would learn "
             "from nothing",
         ),
-        (race.marl_episodes >= 1, "race.marl-episodes", race.marl_episodes, "at least 1"),
-        (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
-        *_population_rules(race),
         *_env_rules(config.env),
         (config.evaluation.every >= 1, "evaluation.every", config.evaluation.every, "at least 1"),
         (
