@@ -106,6 +106,7 @@ class Slots(NamedTuple):
     first: Bool[Any, "L R"]  # an episode begins here
     acted: Bool[Any, "L R"]  # a step was made here
     real: Bool[Any, "L R"]  # there is something here
+    moment: Int[Any, "L R"]  # a number of its own for each moment in the buffer
 
 
 class Team(NamedTuple):
@@ -129,6 +130,18 @@ class Rollout(NamedTuple):
     transitions: Transition  # leading axis: steps of all teams
     episode_return: Float[np.ndarray, "T"]
     episode_length: NDArray[np.int64]  # [T]
+    team: NDArray[np.int64]  # whose each step is
+    repeated: NDArray[np.int64]  # [T], how often each episode was begun anew
+
+    def of(self, teams: range) -> "Rollout":
+        """What some of the teams brought."""
+        part = slice(teams.start, teams.stop)
+        results = (self.episode_return[part], self.episode_length[part])
+        if len(teams) == len(self.episode_return):
+            return self
+        rows = np.flatnonzero((self.team >= teams.start) & (self.team < teams.stop))
+        transitions = Transition(*(column[rows] for column in self.transitions))
+        return Rollout(transitions, *results, self.team[rows] - teams.start, self.repeated[part])
 
 
 @dataclass(frozen=True)

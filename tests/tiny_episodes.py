@@ -136,6 +136,7 @@ def laid_out(
         first=np.zeros(shape, bool),
         acted=np.zeros(shape, bool),
         real=np.zeros(shape, bool),
+        moment=empty(40, np.int32),
     )
     where = {}
     for row, episodes in enumerate(rows):
@@ -149,6 +150,7 @@ def laid_out(
                 slots.last_action[here] = batch.action[e, t - 1] if t else -1
                 slots.first[here], slots.real[here] = t == 0, True
                 slots.acted[here] = t < length
+                slots.moment[here] = e * (T + 1) + t
                 if t < length:
                     where[e, t] = here
                     for name in ("action", "reward", "terminated"):
@@ -186,27 +188,29 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
     """
     draws = Draws([], [])
     laid: list[Laid] = []
-    gumbel, permutation = jax.random.gumbel, jax.random.permutation
+    module = sys.modules["race.learners.facmac"]
+    gumbel_noise, deal_out = module.gumbel_noise, module.deal_out
 
     def record(kept: list[np.ndarray], values: Any) -> Any:
         jax.debug.callback(lambda x: kept.append(np.asarray(x)), values)
         return values
 
-    def noise(key: Any, shape: tuple[int, ...], dtype: Any) -> Any:
+    def noise(key: Any, moment: Any, shape: tuple[int, ...]) -> Any:
         if not fixed:
-            return record(draws.noise, gumbel(key, shape, dtype))
-        times = np.zeros(shape[:2], int)
+            return record(draws.noise, gumbel_noise(key, moment, shape))
+        times = np.zeros(moment.shape, int)
         for (_, t), place in laid[0].where.items():
             times[place] = t
-        rows = [gumbel(jax.random.fold_in(key, t), shape[2:], dtype) for t in range(T)]
+        rows = [jax.random.gumbel(jax.random.fold_in(key, t), shape) for t in range(T)]
         return jnp.stack(rows)[times]
 
-    def deal(key: Any, count: int) -> Any:
+    def deal(key: Any, moment: Any, real: Any) -> Any:
         if not fixed:
-            return record(draws.deals, permutation(key, count))
+            return record(draws.deals, deal_out(key, moment, real))
         order = np.random.default_rng(0).permutation(len(laid[0].where))
         samples = np.array([laid[0].sample_of[step] for step in sorted(laid[0].where)])[order]
-        return jnp.asarray(np.concatenate([samples, np.setdiff1d(np.arange(count), samples)]))
+        rest = np.setdiff1d(np.arange(moment.size), samples)
+        return jnp.asarray(np.concatenate([samples, rest]))
 
     update = jax.jit(
         partial(algorithm.update, spec=SPEC, shape=shape_of(config), hyper=hyper_of(config))
@@ -217,9 +221,9 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
         for kept in draws:
             kept.clear()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys.modules["race.learners.facmac"], "GROUP", GROUP)
-            patch.setattr(jax.random, "gumbel", noise)
-            patch.setattr(jax.random, "permutation", deal)
+            patch.setattr(module, "GROUP", GROUP)
+            patch.setattr(module, "gumbel_noise", noise)
+            patch.setattr(module, "deal_out", deal)
             after, critics, policies = update(
                 before, batch.slots, jnp.int32(number), jax.random.key(5)
             )

@@ -17,6 +17,8 @@ from race.config.presets import resolve
 from race.config.settings import Config, RaceConfig
 from race.config.shape import shape_of
 from race.envs import make_continuous_task, make_discrete_task
+from race.errors import DivergenceError
+from race.rollouts.base import Play
 from race.rollouts.discrete import EpisodeRollouts
 from race.training.records import generation_row
 from race.training.run_state import Progress
@@ -98,12 +100,13 @@ def _measure_rollouts(name: str) -> list[Measurement]:
     )
     teams = algorithm.teams(state, task.spec, shape)
     with EpisodeRollouts(config, task) as rollouts:
-        replay, made = rollouts.empty_replay(), 0
+        replay, made = rollouts.empty_replay(config), 0
 
         def play() -> Any:
             nonlocal replay, made
-            replay, played = rollouts.play(teams, 1, 0, 0, replay)
-            made = played.env_steps
+            (result,) = rollouts.play([Play(config, teams, 1, 0, 0, replay)])
+            assert not isinstance(result, DivergenceError)
+            replay, made = result[0], result[1].env_steps
             return replay
 
         play()

@@ -13,7 +13,7 @@ from race.bench.measurement import Measurement, Subject
 from race.bench.update import setting
 from race.config.settings import Algo
 from race.runs import directory as run_directory
-from race.training.generation import CHUNK
+from race.training.learning import CHUNK
 from race.training.run_state import Progress
 from race.training.trainer import train
 

@@ -54,7 +54,7 @@ def main(arguments: list[str]) -> None:
     from race.cli.progress import rounded
     from race.compilation import use_cache
     from race.rollouts import rollouts_of
-    from race.rollouts.base import Score
+    from race.rollouts.base import Score, Trial
     from race.teams.trained import load_trained
 
     use_cache()
@@ -70,8 +70,8 @@ def main(arguments: list[str]) -> None:
     ):
         playing = bar.add_task("playing", total=len(seeds))
         for batch in batches:
-            heads = {name: trained.heads[name]}
-            parts.append(rollouts.test(trained.encoders[name], heads, batch)[name])
+            trial = Trial(trained.encoders[name], {name: trained.heads[name]}, batch)
+            parts.append(rollouts.test([trial])[0][name])
             bar.advance(playing, len(batch))
     wins = [part.won for part in parts if part.won is not None]
     score = Score(

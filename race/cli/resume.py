@@ -1,39 +1,41 @@
 """``race resume``."""
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from race.config.cohort import CohortConfig
 from race.config.presets import resolve
 
 
 @dataclass(frozen=True)
 class Resume:
-    """Go on with a run exactly where it was, or with all of several seeds that are unfinished.
+    """Go on with a run exactly where it was, or with all of several that are unfinished.
 
     The newest checkpoint is loaded, rows of metrics written after it are dropped and written
     again, number for number (times excepted) as if the run had never stopped.
     """
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
-    """The run's directory, or that of several seeds."""
+    """The run's directory, or that of several seeds or of a sweep."""
     env_steps: int | None = None
     """Train up to this many environment steps instead of what the run began with."""
     without_metrics: bool = False
     """Go on although the rows of metrics.jsonl are lost or damaged: the file is put aside and a new
     one begins, which says so."""
     jobs: int | None = None
-    """If DIR holds the runs of several seeds: so many at a time. None: as many as cores, or one on
-    an accelerator."""
+    """If DIR holds several runs: so many processes at a time. None: as many as cores, or as
+    accelerators."""
+    cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments and trains."""
     chosen = tyro.cli(Resume, args=arguments, prog="race resume")
-    from race.cli.seeds import directories_of, run_all
+    from race.cli.fleet import directories_of, run_all
     from race.cli.training import run
     from race.errors import ConfigError
     from race.runs import directory as run_directory
@@ -41,11 +43,18 @@ def main(arguments: list[str]) -> None:
 
     if not RunDirectory(chosen.run_dir).config.exists() and directories_of(chosen.run_dir):
         if chosen.without_metrics:
-            raise ConfigError("--without-metrics is for one run: name the seed's directory.")
-        run_all(chosen.run_dir, chosen.jobs, chosen.env_steps)
+            raise ConfigError("--without-metrics is for one run: name its directory.")
+        run_all(
+            chosen.run_dir,
+            directories_of(chosen.run_dir),
+            jobs=chosen.jobs,
+            env_steps=chosen.env_steps,
+            cohort=chosen.cohort,
+        )
         return
-    if chosen.jobs is not None:
-        raise ConfigError(f"--jobs has no effect on {chosen.run_dir}, which is one run.")
+    for option, given in (("jobs", chosen.jobs), ("cohort.*", chosen.cohort != CohortConfig())):
+        if given is not None and given is not False:
+            raise ConfigError(f"--{option} has no effect on {chosen.run_dir}, which is one run.")
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))

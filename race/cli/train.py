@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import tyro
 
 from race.config.ablations import AblationName, ablated
+from race.config.cohort import CohortConfig
 from race.config.effects import refuse_without_effect
 from race.config.presets import PRESETS, resolve
 from race.config.settings import (
@@ -51,8 +52,8 @@ class Train:
     """Several seeds instead, such as 1-5 or 1,4,7: a run each, in RUN_DIR/seedN, at once as far as
     there are cores. `race resume RUN_DIR` goes on with all of them."""
     jobs: int | None = None
-    """With --seeds: runs at a time, each kept on one core. None: as many as cores, or one on an
-    accelerator."""
+    """With --seeds: processes at a time, each kept on one core. None: as many as cores, or as
+    accelerators."""
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
     run_dir: Path | None = None
@@ -67,6 +68,7 @@ class Train:
     env: EnvConfig = field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
 def main(arguments: list[str]) -> None:
@@ -81,8 +83,9 @@ def main(arguments: list[str]) -> None:
     )
     # Not before the arguments are parsed: these take a second to import.
     from race.algorithms.evolutions import evolution_of
-    from race.cli.seeds import SHARED_ACCELERATOR, run_all
+    from race.cli.fleet import directories_of, run_all
     from race.cli.training import run
+    from race.cli.worker import SHARED_ACCELERATOR
     from race.compilation import use_cache
     from race.envs import make_task
     from race.envs.description import describe
@@ -98,8 +101,9 @@ def main(arguments: list[str]) -> None:
     config = resolve(asked, discrete=discrete)
     evolution_of(config.race.evolution)  # an operator that is not there is told of at once
     if chosen.seeds is None:
-        if chosen.jobs is not None:
-            raise ConfigError("--jobs has no effect without --seeds. Leave it out.")
+        for option, given in (("jobs", chosen.jobs), ("cohort.*", chosen.cohort != CohortConfig())):
+            if given:
+                raise ConfigError(f"--{option} has no effect without --seeds. Leave it out.")
         path = chosen.run_dir or Path("runs") / f"{_name(config)}-seed{config.seed}"
         run_directory.refuse_occupied(path)
         run_directory.create(path, config, describe(task) | _tried(asked.task, task))
@@ -107,7 +111,7 @@ def main(arguments: list[str]) -> None:
         return
     path = chosen.run_dir or Path("runs") / _name(config)
     _create_all(path, config, chosen, task)
-    run_all(path, chosen.jobs)
+    run_all(path, directories_of(path), jobs=chosen.jobs, cohort=chosen.cohort)
 
 
 def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
@@ -127,7 +131,8 @@ def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
 
 def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:
     """Makes the run directories of several seeds, or none."""
-    from race.cli.seeds import check_jobs, parse_seeds
+    from race.cli.fleet import check_jobs
+    from race.cli.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
 

@@ -49,6 +49,7 @@ class Moments(NamedTuple):
     state: Float[Array, "L R S"]
     first: Bool[Array, "L R"]  # an episode begins here
     real: Float[Array, "L R"]  # 0 where no step was made, or in `later` where there is no moment
+    moment: Int[Array, "L R"]  # chance depends on it, so that the layout has no say
 
 
 def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> GruEncoder:
@@ -143,6 +144,7 @@ def _moments(slots: Slots, real: Float[Array, "L R"]) -> Moments:
         state=slots.state.astype(jnp.float32),
         first=slots.first,
         real=real,
+        moment=slots.moment,
     )
 
 
@@ -168,8 +170,20 @@ def act(
     spec: DiscreteSpec,
 ) -> Float[Array, "B N A"]:
     """Samples of all agents' policies, with the gradient of a softmax."""
-    action = gumbel_softmax(logits(z, head), moments.avail_actions, key)
+    noise = gumbel_noise(key, moments.moment, moments.avail_actions.shape[2:])
+    action = gumbel_softmax(logits(z, head), moments.avail_actions, noise)
     return action.reshape(-1, *action.shape[2:])
+
+
+def gumbel_noise(
+    key: PRNGKeyArray, moment: Int[Array, "L R"], shape: tuple[int, ...]
+) -> Float[Array, "L R N A"]:
+    """Gumbel noise of each moment, wherever in a minibatch it lies."""
+
+    def of_one(moment: Int[Array, ""]) -> Float[Array, "N A"]:
+        return jax.random.gumbel(jax.random.fold_in(key, moment), shape)
+
+    return jax.vmap(jax.vmap(of_one))(moment)
 
 
 def target_action(
@@ -252,7 +266,8 @@ def mutual_information(
 ) -> Float[Array, "1 B"]:
     """Signals of every step, averaged over the agents that have something to choose.
 
-    The steps of a minibatch are thrown together and dealt out anew, `GROUP` at a time; a step's
+    The steps of a minibatch are thrown together and dealt out anew, `GROUP` at a time, in an order
+    that depends on which steps they are and not on where in the minibatch they lie; a step's
     negatives are the same agent's embeddings at the other steps of its group. All pairs of a
     minibatch would be a thousand times as many as its steps. An agent with one available action
     (a dead one) has no part in it; the signal of a step at which all are such is 0.
@@ -262,7 +277,8 @@ def mutual_information(
     counted = living.astype(z.dtype) * moments.real[..., None]
     samples = z.shape[0] * z.shape[1]
     groups = -(-samples // GROUP)
-    deal = jax.random.permutation(key, groups * GROUP)
+    order = deal_out(key, moments.moment.reshape(-1), moments.real.reshape(-1) > 0)
+    deal = jnp.concatenate([order, jnp.arange(samples, groups * GROUP)])
 
     def dealt(x: Array) -> Array:
         flat = x.reshape(samples, *x.shape[2:])
@@ -279,6 +295,13 @@ def mutual_information(
     total = jnp.sum(jnp.swapaxes(signal, 1, 2) * count, axis=2)
     mean = total / jnp.maximum(jnp.sum(count, axis=2), 1.0)
     return mean.reshape(-1)[jnp.argsort(deal)[:samples]][None]
+
+
+def deal_out(key: PRNGKeyArray, moment: Int[Array, "B"], real: Bool[Array, "B"]) -> Int[Array, "B"]:
+    """The samples of a minibatch in a random order of its steps; what is no step comes last."""
+    bits = jax.vmap(lambda one: jax.random.bits(jax.random.fold_in(key, one)))(moment)
+    # Two steps of the same number, one in a few million, are told apart by which they are.
+    return jnp.lexsort((moment, bits, ~real))
 
 
 def policy_due(step: Int[Array, ""], shape: Shape) -> bool:

@@ -19,15 +19,19 @@ def greedy(logits: Float[Array, "*b A"], available: Bool[Array, "*b A"]) -> Int[
 
 
 def gumbel_softmax(
-    logits: Float[Array, "*b A"], available: Bool[Array, "*b A"], key: PRNGKeyArray
+    logits: Float[Array, "*b A"], available: Bool[Array, "*b A"], noise: Float[Array, "*b A"]
 ) -> Float[Array, "*b A"]:
     """A one-hot sample of the policy whose gradient is that of a softmax (Jang et al. 2017).
 
     The sample is distributed as the softmax of the logits over the available actions. Its gradient
     is that of the softmax of the perturbed logits, at temperature 1: straight-through. Where only
     one action is available, the gradient is 0.
+
+    Args:
+        logits: of the policy.
+        available: which actions can be chosen.
+        noise: `jax.random.gumbel` of the logits' shape.
     """
-    noise = jax.random.gumbel(key, logits.shape, logits.dtype)
     perturbed = masked(logits + noise, available)
     soft = jax.nn.softmax(perturbed, axis=-1)
     hard = jax.nn.one_hot(jnp.argmax(perturbed, axis=-1), logits.shape[-1], dtype=logits.dtype)

@@ -91,6 +91,7 @@ def slots_of(replay: Replay, layout: Layout) -> Slots:
         first=layout.time == 0,
         acted=acted,
         real=real,
+        moment=layout.place * data.obs.shape[1] + time,
     )
 
 

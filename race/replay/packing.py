@@ -44,6 +44,12 @@ def bins(lengths: Sequence[int], size: int) -> list[list[int]]:
     return rows
 
 
+def widened(layout: Layout, rows: int) -> Layout:
+    """The same with empty rows behind the others, ``rows`` in all."""
+    more = [(0, 0), (0, 0), (0, rows - layout.time.shape[2])]
+    return Layout(np.pad(layout.place, more), np.pad(layout.time, more, constant_values=-1))
+
+
 def layouts(
     places: Int[np.ndarray, "steps B"],
     lengths: Int[np.ndarray, "steps B"],

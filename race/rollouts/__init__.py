@@ -10,15 +10,22 @@ from race.rollouts.transitions import TransitionRollouts
 from race.types import AnyTask, Task
 
 
-def rollouts_of(config: Config, task: AnyTask, *, proven: bool = False) -> Rollouts:
-    """The rollouts of a task, for a run of a resolved configuration.
+def rollouts_of(
+    config: Config, task: AnyTask, *, proven: bool = False, runs: int = 1, together: bool = False
+) -> Rollouts:
+    """The rollouts of a task, for one run of a resolved configuration or for several.
 
-    ``proven``: the run has played an episode before, so that an environment that fails is an
-    accident from the start.
+    Args:
+        config: of one of the runs, which differ in their numbers alone.
+        task: the task.
+        proven: whether a run has played an episode before, so that an environment that fails is an
+            accident from the start.
+        runs: how many there are.
+        together: whether what several runs do at once is one program.
     """
     if isinstance(task, Task):
-        return TransitionRollouts(config, task, proven=proven)
-    return EpisodeRollouts(config, task, proven=proven)
+        return TransitionRollouts(config, task, proven=proven, runs=runs, together=together)
+    return EpisodeRollouts(config, task, proven=proven, runs=runs if together else 1)
 
 
 __all__ = ["Rollouts", "rollouts_of"]

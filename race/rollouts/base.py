@@ -1,7 +1,7 @@
 """What training asks of rollouts, whatever kind of task they are of."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
+from race.config.settings import Config
 from race.errors import DivergenceError
 from race.replay.buffer import Replay
 
@@ -41,30 +42,58 @@ class Score(NamedTuple):
         return None if self.won is None else float(self.won.mean())
 
 
+class Play(NamedTuple):
+    """The teams of one run that play a generation: the population, then the MARL team.
+
+    The MARL team alone explores; it plays as often as ``n_marl`` says. ``generation`` counts from
+    0, ``env_steps`` were made before; all steps go into the buffer, if it has room at all.
+    """
+
+    config: Config
+    teams: Teams
+    n_marl: int
+    generation: int
+    env_steps: int
+    replay: Replay
+
+
+class Trial(NamedTuple):
+    """Teams that one run tests, over the same encoders, each on all the seeds."""
+
+    encoder: Any
+    heads: Mapping[str, Float[Array, "N H1 A"]]
+    seeds: NDArray[np.int64]
+
+
 class Generation(NamedTuple):
     """What the episodes of one generation came to, one of each acting team."""
 
     episode_return: NDArray[np.float64]  # [T]
     env_steps: int
+    repeated: int
+    """Episodes that were begun anew because an environment failed."""
 
 
 @runtime_checkable
 class Rollouts(Protocol):
-    """A task's environments, played by teams. Use it in a ``with`` statement, or call `close`."""
+    """A task's environments, played by the teams of one run or of several.
+
+    What a run gets does not depend on the others. Use it in a ``with`` statement, or call `close`.
+    """
 
     @property
     def repeated(self) -> int:
         """Episodes that were begun anew because an environment failed, in this process."""
         ...
 
-    def empty_replay(self) -> Replay:
-        """A buffer for what the rollouts bring, with room for all that a run needs."""
+    def empty_replay(self, config: Config) -> Replay:
+        """A buffer for what the rollouts of a run bring, with room for all that it needs."""
         ...
 
     def warm_up(
-        self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
+        self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
     ) -> tuple[Replay, int] | None:
-        """Random episodes before the first generation.
+        """Random episodes of one run before its first generation.
 
         Returns:
             The buffer and the steps made; None if it was interrupted.
@@ -74,32 +103,19 @@ class Rollouts(Protocol):
         """
         ...
 
-    def play(
-        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
-    ) -> tuple[Replay, Generation]:
-        """One episode of every team, all of whose steps go into the buffer if it has room at all.
+    def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
+        """One episode of every team of every run; or how a run diverged.
 
-        Args:
-            teams: the population, then the MARL team, which alone explores, as often as it plays.
-            n_marl: how often that is.
-            generation: number of the generation, from 0.
-            env_steps: made before.
-            replay: the buffer.
+        What that is: an action that is no finite number, on the device also a reward or an
+        observation.
 
         Raises:
-            DivergenceError: if an action is not a finite number, or on the device a reward or an
-                observation.
             TaskError: if an environment fails, or hands over what it may not.
         """
         ...
 
-    def test(
-        self,
-        encoder: Any,
-        heads: Mapping[str, Float[Array, "N H1 A"]],
-        seeds: NDArray[np.int64],
-    ) -> dict[str, Score]:
-        """One episode per seed with each team, without exploration, all on the same seeds."""
+    def test(self, trials: Sequence[Trial]) -> list[dict[str, Score]]:
+        """One episode per seed with each team of each trial, without exploration."""
         ...
 
     def close(self) -> None:

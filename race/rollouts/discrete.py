@@ -1,6 +1,6 @@
 """Rollouts of tasks with discrete actions: whole episodes, on the device where that can be."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, final
 
@@ -18,9 +18,9 @@ from race.method.exploration import epsilon
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Replay, init_replay
 from race.rollouts import device
-from race.rollouts.base import Generation, Score, Steps, check_returns
+from race.rollouts.base import Generation, Play, Score, Steps, Trial, check_returns
 from race.rollouts.choosing import Exploration
-from race.rollouts.episodes import Played, empty_episode
+from race.rollouts.episodes import Part, Played, empty_episode
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
 from race.types import DiscreteTask
@@ -36,17 +36,23 @@ class EpisodeRollouts:
     """A `race.rollouts.base.Rollouts`: on the device if the task can be played there."""
 
     def __init__(
-        self, config: Config, task: DiscreteTask, on_device: bool = True, proven: bool = False
+        self,
+        config: Config,
+        task: DiscreteTask,
+        on_device: bool = True,
+        proven: bool = False,
+        runs: int = 1,
     ) -> None:
         """Nothing is made yet.
 
         Args:
-            config: the run's configuration.
+            config: the configuration of a run.
             task: the task.
             on_device: whether to play on the device if the task can be played there.
-            proven: whether the run has played an episode before.
+            proven: whether a run has played an episode before.
+            runs: how many go on in one program, on the device.
         """
-        self._config, self._spec = config, task.spec
+        self._config, self._spec, self._runs = config, task.spec, runs
         self._env = task.device() if on_device and task.device is not None else None
         pool = EnvPool(
             task,
@@ -65,57 +71,60 @@ class EpisodeRollouts:
         """Episodes that were begun anew since the environments failed, in this process."""
         return self._host.pool.repeated
 
-    def empty_replay(self) -> Replay:
+    def empty_replay(self, config: Config) -> Replay:
         """A short run does not pay for a long one's memory: an episode has at least one step."""
-        config, facmac = self._config, self._config.facmac
+        facmac = config.facmac
         most = max(config.env_steps + config.n_teams, facmac.batch_size)
         item = empty_episode(self._spec, str(facmac.replay_precision))
         return init_replay(item, min(facmac.replay_capacity, most) * config.has_marl)
 
     def warm_up(
-        self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
+        self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
     ) -> tuple[Replay, int] | None:
         """There is none: exploration begins with many random actions."""
         return replay, 0
 
-    def play(
-        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
-    ) -> tuple[Replay, Generation]:
-        """The MARL team chooses at random now and then; the population explores by diversity."""
-        config, facmac = self._config, self._config.facmac
-        share = epsilon(
-            env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
-        )
-        how = Exploration(
-            jnp.arange(teams.count) >= teams.count - n_marl,
-            jnp.float32(share),
-            jax.random.fold_in(root_key(config.seed, Purpose.ROLLOUT), generation),
-        )
-        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, teams.count)
-        played = self._play(teams, seeds, how if n_marl else None)
-        self._check_finite(played, f"generation {generation + 1}")
-        if replay.capacity:
-            replay = programs.store(replay, played.episodes, np.int32(teams.count))
-        returns = np.asarray(played.episode_return, np.float64)
-        return replay, Generation(returns, int(np.sum(played.episodes.length)))
+    def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
+        """MARL teams choose at random now and then; populations explore by their diversity."""
+        parts = [Part(play.teams, _seeds(play), _exploration(play)) for play in plays]
+        before, found = self.repeated, list(self._episodes(parts))
+        results: list[tuple[Replay, Generation] | DivergenceError] = []
+        for play, (played, now) in zip(plays, found, strict=True):
+            try:
+                self._check_finite(played, f"generation {play.generation + 1}")
+            except DivergenceError as error:
+                results.append(error)
+                continue
+            replay = play.replay
+            if replay.capacity:
+                replay = programs.store(replay, played.episodes, np.int32(play.teams.count))
+            returns = np.asarray(played.episode_return, np.float64)
+            steps = int(np.sum(played.episodes.length))
+            results.append((replay, Generation(returns, steps, now - before)))
+            before = now
+        return results
 
-    def test(
-        self,
-        encoder: Any,
-        heads: Mapping[str, Float[Array, "N H1 A"]],
-        seeds: NDArray[np.int64],
-    ) -> dict[str, Score]:
+    def test(self, trials: Sequence[Trial]) -> list[dict[str, Score]]:
         """At most `TESTS_AT_ONCE` episodes of each team at once."""
-        names, n = list(heads), len(seeds)
-        size = self._tests = max(self._tests, min(n, self._most))
-        teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), size, axis=0))
-        parts = []
-        for first in range(0, n, size):
-            piece = seeds[first : first + size]
-            played = self._play(teams, np.tile(np.resize(piece, size), len(names)), None)
-            results = (played.episode_return, played.episodes.length, played.won)
-            shape = (len(names), size)
-            parts.append([np.asarray(r).reshape(shape)[:, : len(piece)] for r in results])
+        longest = max(len(trial.seeds) for trial in trials)
+        size = self._tests = max(self._tests, min(longest, self._most))
+        everyone = [
+            Teams(t.encoder, jnp.repeat(jnp.stack(list(t.heads.values())), size, axis=0))
+            for t in trials
+        ]
+        found: list[list[Any]] = [[] for _ in trials]
+        for first in range(0, longest, size):
+            parts = [
+                Part(teams, np.tile(_small(np.resize(t.seeds[first:], size)), len(t.heads)), None)
+                for t, teams in zip(trials, everyone, strict=True)
+            ]
+            for trial, kept, (played, _) in zip(trials, found, self._episodes(parts), strict=True):
+                results = (played.episode_return, played.episodes.length, played.won)
+                shape, real = (len(trial.heads), size), len(trial.seeds[first : first + size])
+                kept.append([np.asarray(r).reshape(shape)[:, :real] for r in results])
+        return [self._scores(trial, kept) for trial, kept in zip(trials, found, strict=True)]
+
+    def _scores(self, trial: Trial, parts: list[Any]) -> dict[str, Score]:
         returns, lengths, won = (
             np.concatenate(columns, axis=1) for columns in zip(*parts, strict=True)
         )
@@ -125,12 +134,13 @@ class EpisodeRollouts:
                 lengths[i].astype(np.int64),
                 won[i] if self._spec.has_wins else None,
             )
-            for i, name in enumerate(names)
+            for i, name in enumerate(trial.heads)
         }
 
     def episode(self, encoder: Any, head: Float[Array, "N H1 A"], seed: int) -> NDArray[np.int32]:
         """The actions of one episode of a team without exploration, [steps, N]."""
-        played = self._play(Teams(encoder, head[None]), np.array([seed]), None)
+        part = Part(Teams(encoder, head[None]), _small(np.array([seed])), None)
+        ((played, _),) = self._episodes([part])
         steps = int(played.episodes.length[0])
         return np.asarray(played.episodes.action[0, :steps]).astype(np.int32)
 
@@ -149,12 +159,22 @@ class EpisodeRollouts:
     ) -> None:
         self.close()
 
-    def _play(self, teams: Teams, seeds: NDArray[np.int64], how: Exploration | None) -> Played:
-        small = (seeds % 2**31).astype(np.uint32)
+    def _episodes(self, parts: Sequence[Part]) -> Iterator[tuple[Played, int]]:
+        """The episodes of each run, and how many have been begun anew by then."""
         precision = str(self._config.facmac.replay_precision)
         if self._env is None:
-            return self._host.play(teams, small, how, precision)
-        return device.play(self._env, teams, small, how, self._spec, precision)
+            for part in parts:
+                yield self._host.play(*part, precision), self.repeated
+            return
+        alike = len({part.teams.count for part in parts}) == 1
+        if self._runs > 1 and alike:
+            # The program stays the same when some are over.
+            padded = [*parts, *[parts[-1]] * (self._runs - len(parts))]
+            for played in device.play(self._env, padded, self._spec, precision)[: len(parts)]:
+                yield played, self.repeated
+            return
+        for part in parts:
+            yield device.play(self._env, [part], self._spec, precision)[0], self.repeated
 
     def _check_finite(self, played: Played, where: str) -> None:
         check_returns(played.episode_return, where)
@@ -179,3 +199,27 @@ class EpisodeRollouts:
                 f"The environment of team {team} gave {name} in {where}, after {step} steps, "
                 f"with the entry {entry}. {advice}"
             )
+
+
+def _small(seeds: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Seeds below 2**31, which is what environments take."""
+    return (seeds % 2**31).astype(np.uint32)
+
+
+def _seeds(play: Play) -> NDArray[np.uint32]:
+    seed, count = play.config.seed, play.teams.count
+    return _small(host_seeds(seed, Purpose.ROLLOUT, play.generation, count))
+
+
+def _exploration(play: Play) -> Exploration | None:
+    if not play.n_marl:
+        return None
+    facmac, teams = play.config.facmac, play.teams.count
+    share = epsilon(
+        play.env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
+    )
+    return Exploration(
+        jnp.arange(teams) >= teams - play.n_marl,
+        jnp.float32(share),
+        jax.random.fold_in(root_key(play.config.seed, Purpose.ROLLOUT), play.generation),
+    )

@@ -4,8 +4,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt32
 
+from race.algorithms.base import Teams
+from race.rollouts.choosing import Exploration
 from race.types import DiscreteSpec, Episode
 
 
@@ -15,6 +17,14 @@ class Played(NamedTuple):
     episodes: Episode  # leading axis T
     episode_return: Float[Any, "T"]
     won: Bool[Any, "T"]
+
+
+class Part(NamedTuple):
+    """The teams of one run, the seeds of their environments, and how they explore, if they do."""
+
+    teams: Teams
+    seeds: UInt32[Any, "T"]  # below 2**31
+    how: Exploration | None
 
 
 def empty_episode(spec: DiscreteSpec, precision: str, *batch: int) -> Episode:

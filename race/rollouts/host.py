@@ -53,6 +53,7 @@ def collect(
         failures = _play(pool, act, waiting, limit, found)
         attempt += 1
         pool.begin_again(failures, attempt)
+        found.repeated[list(failures)] += 1
         waiting = {team: seed_again(int(seeds[team]), attempt) for team in failures}
     pool.proven = True
     return found.rollout()
@@ -124,6 +125,7 @@ class _Found:
         self._count = 0
         self._return = np.zeros(teams, np.float64)
         self._length = np.zeros(teams, np.int64)
+        self.repeated = np.zeros(teams, np.int64)
 
     def add(
         self, team: int, before: NDArray[np.float32], action: NDArray[np.float32], step: Step
@@ -151,7 +153,8 @@ class _Found:
         kept = self._team[: self._count] >= 0
         whole = slice(self._count) if kept.all() else np.flatnonzero(kept)
         rows = Transition(*(column[whole] for column in self._rows))
-        return Rollout(rows, self._return, self._length)
+        team = self._team[: self._count][whole]
+        return Rollout(rows, self._return, self._length, team, self.repeated)
 
 
 def _rows(count: int, spec: EnvSpec) -> Transition:

@@ -1,23 +1,25 @@
 """Rollouts of tasks with continuous actions: transitions from environments on the host."""
 
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, final
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from race import programs
 from race.algorithms.base import Teams
 from race.config.settings import Config
+from race.errors import DivergenceError
+from race.programs import cohort
 from race.randomness import Purpose, host_seeds
 from race.replay.buffer import Replay, init_replay
-from race.rollouts.base import Generation, Score, Steps
+from race.rollouts.base import Generation, Play, Score, Steps, Trial
 from race.rollouts.host import collect
 from race.rollouts.pool import EnvPool
-from race.types import EnvSpec, Task, Transition
+from race.types import EnvSpec, Rollout, Task, Transition
 
 TESTS_AT_ONCE = 32
 """Most environments that tests keep open; more episodes are played in several rounds."""
@@ -39,13 +41,31 @@ def empty_transition(spec: EnvSpec) -> Transition:
 class TransitionRollouts:
     """A `race.rollouts.base.Rollouts`. Environments are made when they are needed first."""
 
-    def __init__(self, config: Config, task: Task, proven: bool = False) -> None:
+    def __init__(
+        self,
+        config: Config,
+        task: Task,
+        proven: bool = False,
+        runs: int = 1,
+        together: bool = False,
+    ) -> None:
+        """Nothing is made yet.
+
+        Args:
+            config: the configuration of a run.
+            task: the task.
+            proven: whether a run has played an episode before.
+            runs: how many there are, alike but for their numbers.
+            together: whether the teams of all choose in one program.
+        """
         self._config, self._task = config, task
+        self._runs, self._together = runs, together and runs > 1
+        self._usual = runs * config.n_teams
         self._pool = EnvPool(
             task,
-            max(config.n_teams, TESTS_AT_ONCE),
+            max(self._usual, TESTS_AT_ONCE),
             config.env.processes,
-            usual=config.n_teams,
+            usual=self._usual,
             retries=config.env.retries,
             step_seconds=config.env.step_seconds,
             proven=proven,
@@ -56,20 +76,20 @@ class TransitionRollouts:
         """Episodes that were begun anew since the environments failed, in this process."""
         return self._pool.repeated
 
-    def empty_replay(self) -> Replay:
+    def empty_replay(self, config: Config) -> Replay:
         """A short run does not pay for a long one's memory."""
-        learner, teams = self._config.learner, self._config.n_teams
-        longest = learner.random_steps + self._config.env_steps
+        learner, teams = config.learner, config.n_teams
+        longest = learner.random_steps + config.env_steps
         longest += teams * self._task.spec.episode_limit
         capacity = min(learner.replay_capacity, max(longest, programs.INSERT_ROWS))
-        capacity *= self._config.has_marl
+        capacity *= config.has_marl
         return init_replay(empty_transition(self._task.spec), capacity)
 
     def warm_up(
-        self, replay: Replay, report: Steps, interrupted: Callable[[], bool]
+        self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
     ) -> tuple[Replay, int] | None:
         """Uniform actions, exactly as many steps as asked for; none where nothing learns."""
-        config, spec = self._config, self._task.spec
+        spec = self._task.spec
         collected, index = 0, 0
         while config.has_marl and collected < config.learner.random_steps:
             if interrupted():
@@ -95,53 +115,86 @@ class TransitionRollouts:
             index += 1
         return replay, collected
 
-    def play(
-        self, teams: Teams, n_marl: int, generation: int, env_steps: int, replay: Replay
-    ) -> tuple[Replay, Generation]:
-        """The MARL team's actions are noisy; the population explores by its diversity."""
-        config, spec = self._config, self._task.spec
-        seeds = host_seeds(config.seed, Purpose.ROLLOUT, generation, teams.count + 1)
-        noise = np.random.default_rng(int(seeds[-1]))
-        scale = np.float32(config.learner.exploration_noise)
-        shape, first = (n_marl, spec.joint_action_size), teams.count - n_marl
+    def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
+        """All tick together. MARL teams' actions are noisy; populations explore by diversity."""
+        results: list[tuple[Replay, Generation] | DivergenceError] = []
+        # Nothing is stored before all have played: a buffer is used up as it is written.
+        for play, played in zip(plays, self._played(plays), strict=True):
+            if isinstance(played, DivergenceError):
+                results.append(played)
+                continue
+            replay = play.replay
+            if replay.capacity:
+                replay = store(replay, played.transitions)
+            steps, repeated = len(played.transitions.reward), int(played.repeated.sum())
+            results.append((replay, Generation(played.episode_return, steps, repeated)))
+        return results
 
-        def choose(states: NDArray[np.float32], _: int) -> NDArray[np.float32]:
-            actions = np.array(programs.act(teams, states, spec=spec, base=str(config.base)))
-            actions[first:] += scale * noise.standard_normal(shape, np.float32)
+    def _played(self, plays: Sequence[Play]) -> list[Rollout | DivergenceError]:
+        """What each run brings; if one diverges, the others do as if it had not been there."""
+        try:
+            return list(self._play(plays))
+        except DivergenceError as error:
+            if len(plays) == 1:
+                return [error]
+            return [found for play in plays for found in self._played([play])]
+
+    def _play(self, plays: Sequence[Play]) -> list[Rollout]:
+        spec = self._task.spec
+        seeds = [
+            host_seeds(p.config.seed, Purpose.ROLLOUT, p.generation, p.teams.count + 1)
+            for p in plays
+        ]
+        acting = self._acting([play.teams for play in plays])
+        noises: list[np.random.Generator] = []
+        attempt = 0
+
+        def choose(states: NDArray[np.float32], tick: int) -> NDArray[np.float32]:
+            nonlocal attempt, noises
+            if tick == 0:
+                # Anew with every attempt, for how long others played is not a run's own affair.
+                own = [(int(part[-1]), attempt) if attempt else int(part[-1]) for part in seeds]
+                noises, attempt = [np.random.default_rng(seed) for seed in own], attempt + 1
+            actions = acting(states)
+            for play, teams, noise in zip(plays, acting.parts, noises, strict=True):
+                exploring = slice(teams.stop - play.n_marl, teams.stop)
+                scale = np.float32(play.config.learner.exploration_noise)
+                shape = (play.n_marl, spec.joint_action_size)
+                actions[exploring] += scale * noise.standard_normal(shape, np.float32)
             return actions
 
-        rollout = collect(self._pool, choose, seeds[:-1])
-        if replay.capacity:
-            replay = store(replay, rollout.transitions)
-        return replay, Generation(rollout.episode_return, len(rollout.transitions.reward))
+        rollout = collect(self._pool, choose, np.concatenate([part[:-1] for part in seeds]))
+        return [rollout.of(teams) for teams in acting.parts]
 
-    def test(
-        self,
-        encoder: Any,
-        heads: Mapping[str, Float[Array, "N H1 A"]],
-        seeds: NDArray[np.int64],
-    ) -> dict[str, Score]:
-        """At most `TESTS_AT_ONCE` episodes at once."""
-        spec, base = self._task.spec, str(self._config.base)
-        rounds = -(-len(seeds) * len(heads) // TESTS_AT_ONCE)
-        parts: dict[str, list[tuple[NDArray[Any], NDArray[Any]]]] = {name: [] for name in heads}
-        for piece in np.array_split(seeds, rounds):
-            n = len(piece)
-            teams = Teams(encoder, jnp.repeat(jnp.stack(list(heads.values())), n, axis=0))
+    def test(self, trials: Sequence[Trial]) -> list[dict[str, Score]]:
+        """At most `TESTS_AT_ONCE` episodes at once; in one program as many as play a generation."""
+        if not self._together and len(trials) > 1:
+            return [self.test([trial])[0] for trial in trials]
+        most = max(TESTS_AT_ONCE, self._usual) if self._together else TESTS_AT_ONCE
+        rounds = -(-sum(len(t.seeds) * len(t.heads) for t in trials) // most)
+        pieces = [np.array_split(trial.seeds, rounds) for trial in trials]
+        found: list[dict[str, list[Score]]] = [{name: [] for name in t.heads} for t in trials]
+        for turn in range(rounds):
+            seeds = [np.tile(of[turn], len(t.heads)) for t, of in zip(trials, pieces, strict=True)]
+            acting = self._acting(
+                [
+                    Teams(
+                        t.encoder, jnp.repeat(jnp.stack(list(t.heads.values())), len(of[turn]), 0)
+                    )
+                    for t, of in zip(trials, pieces, strict=True)
+                ]
+            )
+            rollout = collect(self._pool, lambda seen, _: acting(seen), np.concatenate(seeds))  # noqa: B023
+            for scores, teams in zip(found, acting.parts, strict=True):
+                part, n = rollout.of(teams), len(teams) // len(scores)
+                for i, kept in enumerate(scores.values()):
+                    own = slice(i * n, (i + 1) * n)
+                    kept.append(Score(part.episode_return[own], part.episode_length[own]))
+        return [{name: _joined(parts) for name, parts in scores.items()} for scores in found]
 
-            def choose(
-                states: NDArray[np.float32], _: int, teams: Teams = teams
-            ) -> NDArray[np.float32]:
-                return np.asarray(programs.act(teams, states, spec=spec, base=base))
-
-            rollout = collect(self._pool, choose, np.tile(piece, len(heads)))
-            for i, name in enumerate(heads):
-                part = slice(i * n, (i + 1) * n)
-                parts[name].append((rollout.episode_return[part], rollout.episode_length[part]))
-        return {
-            name: Score(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
-            for name, found in parts.items()
-        }
+    def _acting(self, teams: list[Teams]) -> "_Acting":
+        runs = self._runs if self._together else 1
+        return _Acting(teams, self._task.spec, str(self._config.base), runs)
 
     def close(self) -> None:
         """Closes the environments and ends their processes."""
@@ -157,6 +210,46 @@ class TransitionRollouts:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+@final
+class _Acting:
+    """The joint actions of the teams of some runs, run after run, with one call a tick or one each.
+
+    Attributes:
+        parts: for each run, the places of its teams.
+    """
+
+    def __init__(self, runs: list[Teams], spec: EnvSpec, base: str, at_once: int) -> None:
+        """``at_once``: runs of one program; more are there than act, once some are over."""
+        ends = np.cumsum([0, *[teams.count for teams in runs]]).tolist()
+        self.parts = [range(first, end) for first, end in itertools.pairwise(ends)]
+        self._runs, self._spec, self._base = runs, spec, base
+        self._stacked = None
+        if at_once > 1 and len({teams.count for teams in runs}) == 1:
+            self._missing = max(at_once - len(runs), 0)
+            self._stacked = cohort.stack((*runs, *[runs[-1]] * self._missing))
+
+    def __call__(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
+        """States [all teams, S] to actions [all teams, U], an array of its own."""
+        how: Any = {"spec": self._spec, "base": self._base}
+        if self._stacked is not None:
+            apart = states.reshape(len(self._runs), -1, states.shape[1])
+            padded = np.pad(apart, ((0, self._missing), (0, 0), (0, 0)))
+            actions = np.asarray(cohort.act(self._stacked, padded, **how))[: len(self._runs)]
+            return actions.reshape(len(states), -1).copy()
+        each = [
+            np.asarray(programs.act(teams, states[part.start : part.stop], **how))
+            for teams, part in zip(self._runs, self.parts, strict=True)
+        ]
+        return np.concatenate(each)
+
+
+def _joined(parts: list[Score]) -> Score:
+    return Score(
+        np.concatenate([part.returns for part in parts]),
+        np.concatenate([part.lengths for part in parts]),
+    )
 
 
 def store(replay: Replay, transitions: Transition) -> Replay:

@@ -37,7 +37,6 @@ class Run:
     clock: Clock
     began: float  # time.perf_counter() when the process began
     identity: str | None  # of the run: its checkpoints and metrics name it
-    repeated_before: int = 0  # episodes that were begun anew before this process
 
     @property
     def statics(self) -> dict[str, Any]:
@@ -48,8 +47,3 @@ class Run:
 def stamped(run: Run, progress: Progress) -> Progress:
     """The progress with the wall times of now."""
     return progress.but(**run.clock.times())
-
-
-def counted(run: Run, progress: Progress) -> Progress:
-    """The progress with the number of episodes begun anew so far."""
-    return progress.but(repeated=run.repeated_before + run.rollouts.repeated)

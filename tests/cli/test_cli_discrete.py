@@ -16,6 +16,7 @@ from race.envs import micro
 from race.envs.discrete_probe.host import ProbeHost
 from race.envs.pymarl import pymarl_task
 from race.errors import ConfigError, TaskError
+from race.rollouts.base import Trial
 from race.rollouts.discrete import EpisodeRollouts
 from race.runs import metrics
 from race.teams.trained import load_trained
@@ -205,7 +206,9 @@ def test_a_battle_of_a_run_is_drawn(battle: Path, capsys: pytest.CaptureFixture[
     trained = load_trained(battle)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
         heads = {"champion": trained.heads["champion"]}
-        score = rollouts.test(trained.encoders["champion"], heads, np.array([7]))["champion"]
+        score = rollouts.test([Trial(trained.encoders["champion"], heads, np.array([7]))])[0][
+            "champion"
+        ]
     steps, worth = int(score.lengths[0]), float(score.returns[0])
     capsys.readouterr()
     race(f"render {battle} --team champion --seed 7 --seconds 0 --out whole.gif")

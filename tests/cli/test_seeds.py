@@ -13,8 +13,9 @@ import pytest
 from commands import fails, race
 from whole_runs import rows
 
-from race.cli import seeds
-from race.cli.seeds import directories_of, parse_seeds
+from race.cli import fleet
+from race.cli.fleet import directories_of
+from race.cli.seeds import parse_seeds
 from race.errors import ConfigError
 from race.runs import directory as run_directory
 
@@ -75,11 +76,11 @@ def test_a_new_budget_is_everybodys_before_anybody_goes_on(
     """Stopped before the second has its turn, a plain resume still knows of it."""
     path = Path(shutil.copytree(both, tmp_path / "runs"))
 
-    def stop_at_once(self: seeds.Worker, core: int | None) -> None:
+    def stop_at_once(self: fleet.Worker, core: int | None, device: str | None = None) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as stopped:
-        stopped.setattr(seeds.Worker, "start", stop_at_once)
+        stopped.setattr(fleet.Worker, "start", stop_at_once)
         with pytest.raises(SystemExit) as ended:
             race(f"resume {path} --env-steps 140 --jobs 1")
     assert ended.value.code == 130
@@ -111,7 +112,7 @@ def test_a_seed_that_fails_is_named_and_the_others_are_trained(
     shutil.rmtree(path / "seed1" / "checkpoints")
     (path / "seed1" / "checkpoints").write_text("a file where a folder should be")
     message = fails(f"resume {path} --env-steps 140 --jobs 2", capsys)
-    assert "Seed 1 failed" in message
+    assert "seed1 failed" in message
     assert "seed1" in message
     assert rows(path / "seed2")[-1]["env_steps"] >= 140
 
@@ -148,17 +149,19 @@ def test_runs_have_a_core_each_where_there_are_enough(
         def poll(self) -> int:
             return 0
 
-    def start(self: seeds.Worker, core: int | None) -> None:
+    def start(self: fleet.Worker, core: int | None, device: str | None = None) -> None:
         started.append(core)
         self.core, self.process = core, Process()  # type: ignore[assignment]
 
-    monkeypatch.setattr(seeds.Worker, "start", start)
+    monkeypatch.setattr(fleet.Worker, "start", start)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5})
     path = Path(shutil.copytree(both, tmp_path / "runs"))
-    seeds.run_all(path, 2, 500)
+    fleet.run_all(path, directories_of(path), jobs=2, env_steps=500)
     assert started == [3, 5]
     started.clear()
-    seeds.run_all(path, 1, 600)  # alone, a run may use them all
+    fleet.run_all(
+        path, directories_of(path), jobs=1, env_steps=600
+    )  # alone, a run may use them all
     assert started == [None, None]
 
 
@@ -168,10 +171,13 @@ def test_more_jobs_than_cores_share_them(
     started: list[int | None] = []
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})
     monkeypatch.setattr(
-        seeds.Worker,
+        fleet.Worker,
         "start",
-        lambda self, core: (started.append(core), setattr(self, "ended", "finished")),
+        lambda self, core, device: (
+            started.append(core),
+            setattr(self.runs[0], "ended", "finished"),
+        ),
     )
     path = Path(shutil.copytree(both, tmp_path / "runs"))
-    seeds.run_all(path, 2, 500)
+    fleet.run_all(path, directories_of(path), jobs=2, env_steps=500)
     assert started == [3, 3]

@@ -129,7 +129,7 @@ def test_bad_input_is_told_and_leaves_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("race.cli.training.train", not_refused)
-    monkeypatch.setattr("race.cli.seeds.run_all", not_refused)
+    monkeypatch.setattr("race.cli.fleet.run_all", not_refused)
     before = set(place.iterdir())
     check(case, capsys, monkeypatch)
     left = {path for path in place.iterdir() if path.name != "__pycache__"}

@@ -352,10 +352,11 @@ def test_signals_of_the_steps_as_dealt(
     nets: Networks,
     seed: int | None,
 ) -> None:
-    # 18 samples in groups of 4: two places of the deal are no samples at all.
-    deal = np.arange(20) if seed is None else np.random.default_rng(seed).permutation(20)
-    monkeypatch.setattr(sys.modules["race.learners.facmac"], "GROUP", GROUP)
-    monkeypatch.setattr(jax.random, "permutation", lambda key, count: jnp.asarray(deal[:count]))
+    # 18 samples in groups of 4: two places of the last group are no samples at all.
+    deal = np.arange(B) if seed is None else np.random.default_rng(seed).permutation(B)
+    module = sys.modules["race.learners.facmac"]
+    monkeypatch.setattr(module, "GROUP", GROUP)
+    monkeypatch.setattr(module, "deal_out", lambda key, moment, real: jnp.asarray(deal))
     z = facmac.encode(nets.encoder, now.moments, SPEC)
     got = facmac.mutual_information(nets.mine, now.moments, z, KEY)
     assert got.shape == (1, B)
@@ -366,6 +367,40 @@ def test_signals_of_the_steps_as_dealt(
     # What is no step has no signal, nor has a step at which all agents are dead.
     assert expected[2][2] == 0
     assert (np.asarray(got[0])[np.asarray(now.mask) == 0] == 0).all()
+
+
+def test_chance_depends_on_the_moments_and_not_on_where_they_lie() -> None:
+    """Noise and order of the same moments in two minibatches of unequal layouts."""
+    module = sys.modules["race.learners.facmac"]
+    one = jnp.array([[3, 0], [7, 0], [9, 4]])
+    two = jnp.array([[4, 9, 7, 3]])
+    noise = [module.gumbel_noise(KEY, moment, (2, 3)) for moment in (one, two)]
+    assert noise[0].shape == (3, 2, 2, 3)
+    for place, other in (((0, 0), (0, 3)), ((1, 0), (0, 2)), ((2, 0), (0, 1)), ((2, 1), (0, 0))):
+        assert jnp.array_equal(noise[0][place], noise[1][other])
+    real = [jnp.array([[True, False], [True, False], [True, True]]), jnp.ones((1, 4), bool)]
+    orders = [
+        moment.reshape(-1)[module.deal_out(KEY, moment.reshape(-1), there.reshape(-1))]
+        for moment, there in zip((one, two), real, strict=True)
+    ]
+    assert orders[0][:4].tolist() == orders[1].tolist()
+    assert sorted(orders[1].tolist()) == [3, 4, 7, 9]
+
+
+def test_moments_are_dealt_with_independently() -> None:
+    module = sys.modules["race.learners.facmac"]
+    moment = jnp.arange(400).reshape(50, 8)
+    actions = module.gumbel_noise(KEY, moment, (5, A)).argmax(axis=-1)
+    for axis in range(3):
+        same = np.asarray(actions == jnp.roll(actions, 1, axis=axis)).mean()
+        assert abs(same - 1 / A) < 5 * np.sqrt(1 / A * (1 - 1 / A) / actions.size)
+    first = [
+        int(module.deal_out(key, jnp.arange(6), jnp.arange(6) < 4)[0])
+        for key in jax.random.split(KEY, 400)
+    ]
+    counts = np.bincount(first, minlength=6)
+    assert counts[4:].sum() == 0
+    assert (np.abs(counts[:4] - 100) < 5 * np.sqrt(400 / 4 * 3 / 4)).all()
 
 
 def test_the_deal_is_drawn_anew_with_every_key(

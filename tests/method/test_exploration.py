@@ -20,6 +20,10 @@ def many(x: Any) -> Any:
     return jnp.broadcast_to(x, (DRAWS, *x.shape))
 
 
+def noise_like(logits: Any, key: Any = KEY) -> Any:
+    return jax.random.gumbel(key, logits.shape, logits.dtype)
+
+
 def policy() -> np.ndarray:
     """The softmax over available actions, in float64."""
     e = np.where(np.asarray(AVAILABLE), np.exp(np.asarray(LOGITS, np.float64)), 0.0)
@@ -39,7 +43,7 @@ def assert_distribution(actions: Any, expected: np.ndarray) -> None:
 
 
 def test_samples_are_one_hot_and_distributed_as_the_policy() -> None:
-    samples = np.asarray(gumbel_softmax(many(LOGITS), many(AVAILABLE), KEY))
+    samples = np.asarray(gumbel_softmax(many(LOGITS), many(AVAILABLE), noise_like(many(LOGITS))))
     assert samples.shape == (DRAWS, A)
     np.testing.assert_allclose(
         np.sort(samples, axis=-1), np.tile([0, 0, 0, 0, 1], (DRAWS, 1)), atol=1e-6
@@ -52,7 +56,7 @@ def test_what_is_not_available_is_never_sampled() -> None:
     keys = jax.random.split(KEY, 2)
     available = jax.random.bernoulli(keys[0], 0.4, (DRAWS, A)).at[:, 2].set(True)
     logits = jnp.where(available, -50.0, 50.0)
-    samples = gumbel_softmax(logits, available, keys[1])
+    samples = gumbel_softmax(logits, available, noise_like(logits, keys[1]))
     assert (jnp.where(available, 0.0, samples) == 0).all()
     np.testing.assert_allclose(samples.sum(axis=-1), 1.0, atol=1e-6)
 
@@ -63,11 +67,13 @@ def test_the_gradient_is_that_of_the_softmax_of_the_perturbed_logits() -> None:
     noise = np.asarray(jax.random.gumbel(KEY, (A,)), np.float64)
 
     def value(logits: Any) -> Any:
-        return jnp.sum(score * gumbel_softmax(logits, AVAILABLE, KEY))
+        return jnp.sum(score * gumbel_softmax(logits, AVAILABLE, noise_like(logits)))
 
     e = np.where(np.asarray(AVAILABLE), np.exp(np.asarray(LOGITS, np.float64) + noise), 0.0)
     p = e / e.sum()
-    assert int(np.argmax(p)) == int(np.argmax(gumbel_softmax(LOGITS, AVAILABLE, KEY)))
+    assert int(np.argmax(p)) == int(
+        np.argmax(gumbel_softmax(LOGITS, AVAILABLE, noise_like(LOGITS)))
+    )
     # d/dx_j of sum_i s_i p_i is p_j (s_j - sum_i s_i p_i).
     expected = p * (np.asarray(score) - (p * np.asarray(score)).sum())
     got = jax.grad(value)(LOGITS)
@@ -84,20 +90,10 @@ def test_where_one_action_is_available_there_is_no_gradient(only: int) -> None:
     available = jnp.arange(A) == only
 
     def value(logits: Any) -> Any:
-        return jnp.sum(score * gumbel_softmax(logits, available, KEY))
+        return jnp.sum(score * gumbel_softmax(logits, available, noise_like(logits)))
 
     assert value(LOGITS) == score[only]
     assert (jax.grad(value)(LOGITS) == 0).all()
-
-
-def test_agents_and_steps_are_sampled_independently() -> None:
-    shape = (50, 8, A)
-    samples = gumbel_softmax(jnp.zeros(shape), jnp.ones(shape, bool), KEY).argmax(axis=-1)
-    for axis in (0, 1):
-        same = np.asarray(samples == jnp.roll(samples, 1, axis=axis)).mean()
-        assert abs(same - 1 / A) < 5 * np.sqrt(1 / A * (1 - 1 / A) / 400)
-    other = gumbel_softmax(jnp.zeros(shape), jnp.ones(shape, bool), jax.random.key(1))
-    assert not jnp.array_equal(other.argmax(axis=-1), samples)
 
 
 # --- choices ------------------------------------------------------------------------------------

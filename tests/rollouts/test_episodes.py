@@ -20,10 +20,12 @@ from race.errors import DivergenceError, TaskError
 from race.learners.facmac import logits, new_encoder
 from race.method.exploration import greedy
 from race.networks.recurrent import embed_episodes
+from race.replay.buffer import Replay
 from race.rollouts import device, discrete
+from race.rollouts.base import Generation, Play, Trial
 from race.rollouts.choosing import Exploration
 from race.rollouts.discrete import EpisodeRollouts
-from race.rollouts.episodes import Played, empty_episode
+from race.rollouts.episodes import Part, Played, empty_episode
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
 from race.types import DeviceEnv, DiscreteSpec, DiscreteTask, Observation, Outcome
@@ -76,10 +78,27 @@ def play(
     seeds = np.asarray(seeds, np.uint32)
     if on_device:
         assert task.device is not None
-        played = device.play(task.device(), teams, seeds, how, task.spec, precision)
+        parts = [Part(teams, seeds, how)]
+        (played,) = device.play(task.device(), parts, task.spec, precision)
         return jax.tree.map(np.asarray, played)
     with HostEnvs(EnvPool(task, len(seeds), processes=False)) as envs:
         return envs.play(teams, seeds, how, precision)
+
+
+def generation_of(
+    rollouts: EpisodeRollouts,
+    config: Config,
+    teams: Teams,
+    generation: int = 0,
+    env_steps: int = 0,
+    replay: Replay | None = None,
+) -> tuple[Replay, Generation]:
+    """What one run's generation brings; its divergence is raised."""
+    replay = rollouts.empty_replay(config) if replay is None else replay
+    (result,) = rollouts.play([Play(config, teams, 1, generation, env_steps, replay)])
+    if isinstance(result, DivergenceError):
+        raise result
+    return result
 
 
 def assert_same(one: Any, other: Any) -> None:
@@ -379,9 +398,10 @@ def test_the_marl_team_alone_explores_in_training_less_and_less(on_device: bool)
     replay_of: dict[int, Any] = {}
     with EpisodeRollouts(config, task, on_device) as rollouts:
         for env_steps in (0, 50, 100, 1000):
-            replay = rollouts.empty_replay()
+            replay = rollouts.empty_replay(config)
             for generation in range(30):
-                replay, _ = rollouts.play(certain(config, task), 1, generation, env_steps, replay)
+                teams = certain(config, task)
+                replay, _ = generation_of(rollouts, config, teams, generation, env_steps, replay)
             replay_of[env_steps] = replay
     shown = {}
     for env_steps, replay in replay_of.items():
@@ -404,9 +424,9 @@ def test_training_is_the_same_on_host_and_device(name: str) -> None:
     teams, found = teams_of(task.spec, config.n_teams), []
     for on_device in (True, False):
         with EpisodeRollouts(config, task, on_device) as rollouts:
-            replay, results = rollouts.empty_replay(), []
+            replay, results = rollouts.empty_replay(config), []
             for generation in range(3):
-                replay, result = rollouts.play(teams, 1, generation, 0, replay)
+                replay, result = generation_of(rollouts, config, teams, generation, 0, replay)
                 results.append(result)
         found.append((replay, results))
     (replay, results), _ = found
@@ -442,7 +462,7 @@ def test_tests_give_every_team_the_same_seeds(
     with EpisodeRollouts(config_of(name), task, on_device) as rollouts:
         for size in (2, 32):  # in parts, of which the last is not full, and at once
             monkeypatch.setattr(discrete, "TESTS_AT_ONCE", size)
-            scores = rollouts.test(encoder, heads, seeds)
+            (scores,) = rollouts.test([Trial(encoder, heads, seeds)])
             assert list(scores) == ["marl", "champion"]
             for team, score in scores.items():
                 want = expected[team]
@@ -468,7 +488,7 @@ def test_large_seeds_are_those_of_31_bits() -> None:
     teams = teams_of(task.spec, 1)
     with EpisodeRollouts(config_of("probe/lives"), task) as rollouts:
         scores = [
-            rollouts.test(teams.encoder, {"marl": teams.heads[0]}, np.array([seed], np.int64))
+            rollouts.test([Trial(teams.encoder, {"marl": teams.heads[0]}, np.array([seed]))])[0]
             for seed in (5, 5 + 2**31)
         ]
     np.testing.assert_array_equal(*(score["marl"].returns for score in scores))
@@ -483,7 +503,8 @@ def test_the_program_is_traced_once_for_all_that_has_its_shape() -> None:
         env = DeviceEnv(np.float32(bonus), count_reset, count_step)
         some = Teams(teams.encoder, teams.heads[:n])
         seeds = np.arange(seed, seed + n, dtype=np.uint32)
-        return device.play(env, some, seeds, how, task.spec, "float32")
+        (played,) = device.play(env, [Part(some, seeds, how)], task.spec, "float32")
+        return played
 
     first = run()
     before = count()
@@ -530,12 +551,9 @@ def test_the_program_is_traced_once_for_all_that_has_its_shape() -> None:
 def test_an_environment_that_fails_names_its_task(
     failure: str, told: str, made: list[Countdown]
 ) -> None:
-    task = broken(failure)
-    with (
-        EpisodeRollouts(config_of("countdown"), task) as rollouts,
-        pytest.raises(TaskError, match=told),
-    ):
-        rollouts.play(teams_of(task.spec, 5), 1, 0, 0, rollouts.empty_replay())
+    task, config = broken(failure), config_of("countdown")
+    with EpisodeRollouts(config, task) as rollouts, pytest.raises(TaskError, match=told):
+        generation_of(rollouts, config, teams_of(task.spec, 5))
     assert made
     assert all(env.closed for env in made)
 
@@ -545,12 +563,12 @@ def test_observations_too_large_for_the_buffer_are_refused(made: list[Countdown]
     for precision, fits in (("float16", False), ("float32", True)):
         config = config_of("countdown", replay_precision=precision)
         with EpisodeRollouts(config, task) as rollouts:
-            teams, replay = teams_of(task.spec, 5), rollouts.empty_replay()
+            teams = teams_of(task.spec, 5)
             if fits:
-                assert int(rollouts.play(teams, 1, 0, 0, replay)[0].inserted) == 5
+                assert int(generation_of(rollouts, config, teams)[0].inserted) == 5
             else:
                 with pytest.raises(DivergenceError, match="replay-precision float16"):
-                    rollouts.play(teams, 1, 0, 0, replay)
+                    generation_of(rollouts, config, teams)
 
 
 @pytest.mark.parametrize(("n_actions", "dtype"), [(256, np.uint8), (257, np.uint16)])

@@ -20,7 +20,9 @@ from race.config.settings import (
 from race.envs import factorised
 from race.errors import EnvFailedError, HandedOverError, TaskError
 from race.runs import checkpoints
+from race.runs import directory as run_directory
 from race.training.run_state import Progress
+from race.training.trainer import Order, train, train_cohort
 from race.types import Task
 
 TASK = "test_failures:task"
@@ -136,3 +138,42 @@ def test_a_run_is_saved_before_its_environment_ends_it(
     Faulty.broken_from = Faulty.wrong_from = 10**9  # it is mended
     run(tmp_path, small())
     assert rows(tmp_path) == whole
+
+
+def test_populations_and_cohorts_are_saved_too(tmp_path: Path) -> None:
+    """In a test after a generation, when the MARL teams have entered the populations."""
+    made = [small(algo="race", env_steps=150, seed=seed) for seed in (1, 2)]
+    for config in made:
+        run_directory.create(tmp_path / f"alone{config.seed}", config)
+        train(tmp_path / f"alone{config.seed}", config)
+        run_directory.create(tmp_path / f"seed{config.seed}", config)
+    orders = [Order(tmp_path / f"seed{config.seed}", config) for config in made]
+    Faulty.episodes = 0
+    # 16 episodes each at random, cut short, then 6 each a generation, of 30 steps; the first tests
+    # are at 70.
+    Faulty.broken_from = 2 * 16 + 2 * 6 + 3
+    with pytest.raises(EnvFailedError, match=r"The runs were saved at 70, 70 .* race resume"):
+        train_cohort(orders, batching="map")
+    Faulty.broken_from = 10**9
+    train_cohort(orders, batching="map")
+    for config in made:
+        expected = rows(tmp_path / f"alone{config.seed}")
+        assert rows(tmp_path / f"seed{config.seed}") == expected
+
+
+def test_repeated_episodes_of_a_cohort_are_what_they_are_alone(tmp_path: Path) -> None:
+    """Noise too, however long the others played."""
+    made = [small(env_steps=100, seed=seed) for seed in (3, 4)]
+    for config in made:
+        run(tmp_path / f"alone{config.seed}", dataclasses.replace(config, env_steps=60))
+        run_directory.create(tmp_path / f"seed{config.seed}", config)
+    orders = [Order(tmp_path / f"seed{c.seed}", dataclasses.replace(c, env_steps=60)) for c in made]
+    train_cohort(orders, batching="map")
+    Faulty.failing_seeds, Faulty.failures = 4, 0
+    for config in made:
+        run(tmp_path / f"alone{config.seed}", config)
+    assert Faulty.failures > 2
+    train_cohort([dataclasses.replace(o, config=c) for o, c in zip(orders, made, strict=True)])
+    for config in made:
+        expected = rows(tmp_path / f"alone{config.seed}")
+        assert rows(tmp_path / f"seed{config.seed}") == expected

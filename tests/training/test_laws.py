@@ -22,7 +22,7 @@ from race.config.settings import (
 from race.envs import discrete_probe, probe
 from race.runs import checkpoints
 from race.teams.trained import load_trained
-from race.training import generation
+from race.training import learning
 from race.training.run_state import Progress
 
 POPULATION = 5
@@ -74,8 +74,8 @@ def small(algo: str, base: str, task: str, **race: Any) -> Config:
 def test_the_laws_hold(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, base: str, task: str
 ) -> None:
-    monkeypatch.setattr(generation, "CHUNK", 7)
-    monkeypatch.setattr(generation, "EPISODES_CHUNK", 2)
+    monkeypatch.setattr(learning, "CHUNK", 7)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
     config = small(algo, base, task)
     progress = run(tmp_path / "whole", config)
     check_rows(tmp_path / "whole", config, progress)

@@ -27,7 +27,7 @@ from race.config.settings import (
 from race.envs import factorised
 from race.errors import DivergenceError
 from race.runs import checkpoints
-from race.training import generation, trainer
+from race.training import learning, trainer
 from race.training.run_state import Progress
 from race.training.trainer import train
 from race.types import Task
@@ -48,7 +48,7 @@ def small(task: str = "probe/terminates", **changes: Any) -> Config:
 
 @pytest.fixture(autouse=True)
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "CHUNK", 7)
+    monkeypatch.setattr(learning, "CHUNK", 7)
 
 
 @pytest.fixture(scope="module")

@@ -32,7 +32,7 @@ from race.replay.buffer import distinct_places
 from race.rollouts.discrete import EpisodeRollouts
 from race.runs import checkpoints
 from race.runs import directory as run_directory
-from race.training import generation
+from race.training import learning
 from race.training.run import Report
 from race.training.run_state import Progress
 from race.types import DiscreteTask
@@ -133,7 +133,7 @@ def assert_same(one: Any, other: Any) -> None:
 
 @pytest.fixture(autouse=True)
 def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "EPISODES_CHUNK", 2)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
 
 
 @pytest.fixture(scope="module")
@@ -283,7 +283,7 @@ def test_learning_is_traced_once_per_shape_and_sees_whole_episodes(
         return real(state, sums, replay, *others, layouts=layouts, **statics)
 
     monkeypatch.setattr(programs, "learn", spy)
-    monkeypatch.setattr(generation, "EPISODES_CHUNK", 1)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 1)
     programs.TRACES.clear()
     facmac = {"gradient_steps_per_episode": 1.0}
     progress = run(tmp_path, small(UNEQUAL, facmac, algo="facmac", env_steps=150))
@@ -373,7 +373,7 @@ def selected_returns(
 def test_learners_solve_the_matching_of_cues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, env_steps: int
 ) -> None:
-    monkeypatch.setattr(generation, "EPISODES_CHUNK", 12)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 12)
     found = selected_returns(tmp_path, "probe/matching", algo, env_steps)
     assert found[-1] >= 0.9 * PROBES["probe/matching"].optimal_return
     # Agents that choose any available action are right 0.4 of the time.
@@ -382,7 +382,7 @@ def test_learners_solve_the_matching_of_cues(
 
 @pytest.mark.slow
 def test_race_climbs_to_the_better_optimum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(generation, "EPISODES_CHUNK", 12)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 12)
     population = RaceConfig(policy_embedding_size=3, mine_size=5, population_size=9)
     found = selected_returns(
         tmp_path, "probe/climb", "race", 2000, ratio=0.2, race=population, seed=2

@@ -1,4 +1,7 @@
-"""The compiled programs of a run. Each is traced once per run; `TRACES` counts it."""
+"""The compiled programs of a run. Each is traced once per run; `TRACES` counts it.
+
+`race.programs.cohort` holds those of several runs at once.
+"""
 
 from collections import Counter
 from functools import partial
@@ -101,7 +104,7 @@ def draw(
     return places, replay.data.length[places]
 
 
-@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
 def evolve(
     state: Any,
     fitness: Float[Array, "P"],
@@ -117,7 +120,7 @@ def evolve(
     return algorithm.evolve(state, fitness, key, spec, shape, hyper)
 
 
-@partial(jax.jit, static_argnames=("algorithm", "shape"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("algorithm", "shape"))
 def inject(
     state: Any, key: PRNGKeyArray, *, hyper: Hyper, algorithm: Algorithm, shape: Shape
 ) -> Any:
@@ -143,6 +146,13 @@ def act(
 ) -> Float[Array, "T U"]:
     """The joint actions of all teams, each in its own state: one batched call per tick."""
     TRACES["act"] += 1
+    return joint_actions(teams, jnp.asarray(state), spec=spec, base=base)
+
+
+def joint_actions(
+    teams: Teams, state: Float[Array, "T S"], *, spec: EnvSpec, base: str
+) -> Float[Array, "T U"]:
+    """What `act` compiles."""
     encode = LEARNERS[base].encode
     if not teams.own_encoders:
         return act_teams(encode(teams.encoder, state, spec), teams.heads, spec)
