@@ -17,6 +17,7 @@ _BEGAN = time.perf_counter()
 
 COMMANDS = {
     "train": "train a team",
+    "sweep": "train many runs: combinations of settings, seeds, tasks",
     "resume": "go on with a run exactly where it was",
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",
@@ -96,7 +97,7 @@ def _run(arguments: list[str] | None) -> None:
 
 def _told(command: str, error: Exception) -> str | None:
     """What a user is told of an error; None if it is none of theirs or of their machine's."""
-    out_of_memory = _OUT_OF_MEMORY + (_SMALLER if command in ("train", "resume") else "")
+    out_of_memory = _OUT_OF_MEMORY + (_SMALLER if command in ("train", "resume", "sweep") else "")
     match error:
         case BrokenPipeError():
             return None

@@ -147,7 +147,7 @@ def run_all(
     runs = [Watched(run, run_directory.open_run(run)) for run in places]
     for run in runs:
         run.look()
-    devices = _accelerators()
+    devices = accelerators()
     groups = crews(runs, cohort.batching, cohort.width, devices)
     workers = [Worker(group, cohort.batching) for group in groups]
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
@@ -186,7 +186,8 @@ def run_all(
     _say_how_it_ended(path, workers, console)
 
 
-def _accelerators() -> int:
+def accelerators() -> int:
+    """How many there are that JAX uses; 0 where it computes on processors."""
     import jax
 
     return 0 if jax.default_backend() == "cpu" else jax.local_device_count()

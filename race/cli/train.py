@@ -82,7 +82,6 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
-    from race.algorithms.evolutions import evolution_of
     from race.cli.fleet import directories_of, run_all
     from race.cli.training import run
     from race.cli.worker import SHARED_ACCELERATOR
@@ -95,26 +94,40 @@ def main(arguments: list[str]) -> None:
         os.environ.update(SHARED_ACCELERATOR)
     use_cache()
     task = make_task(asked.task, asked.env)
-    discrete = isinstance(task, DiscreteTask)
-    asked = ablated(asked, chosen.ablation, discrete)
-    _refuse_without_effect(asked, chosen.preset, task)
-    config = resolve(asked, discrete=discrete)
-    evolution_of(config.race.evolution)  # an operator that is not there is told of at once
+    config = settled(asked, chosen.preset, chosen.ablation, task)
     if chosen.seeds is None:
         for option, given in (("jobs", chosen.jobs), ("cohort.*", chosen.cohort != CohortConfig())):
             if given:
                 raise ConfigError(f"--{option} has no effect without --seeds. Leave it out.")
-        path = chosen.run_dir or Path("runs") / f"{_name(config)}-seed{config.seed}"
+        path = chosen.run_dir or Path("runs") / f"{name_of(config)}-seed{config.seed}"
         run_directory.refuse_occupied(path)
-        run_directory.create(path, config, describe(task) | _tried(asked.task, task))
+        run_directory.create(path, config, describe(task) | tried(asked.task, task))
         run(path, config)
         return
-    path = chosen.run_dir or Path("runs") / _name(config)
+    path = chosen.run_dir or Path("runs") / name_of(config)
     _create_all(path, config, chosen, task)
     run_all(path, directories_of(path), jobs=chosen.jobs, cohort=chosen.cohort)
 
 
-def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
+def settled(
+    asked: Config, preset: Preset, ablation: tuple[AblationName, ...], task: AnyTask
+) -> Config:
+    """What a person asks for, with ablations and all that follows from the task.
+
+    Raises:
+        ConfigError: if something is wrong, has no effect, or does not go together.
+    """
+    from race.algorithms.evolutions import evolution_of
+
+    discrete = isinstance(task, DiscreteTask)
+    asked = ablated(asked, ablation, discrete)
+    _refuse_without_effect(asked, preset, task)
+    config = resolve(asked, discrete=discrete)
+    evolution_of(config.race.evolution)  # an operator that is not there is told of at once
+    return config
+
+
+def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """What a first look at an environment of the user's own says; others repeat."""
     from race.cli import streams
     from race.envs.own import is_own
@@ -132,7 +145,7 @@ def _tried(task_id: str, task: AnyTask) -> dict[str, Any]:
 def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:
     """Makes the run directories of several seeds, or none."""
     from race.cli.fleet import check_jobs
-    from race.cli.seeds import parse_seeds
+    from race.config.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
 
@@ -149,7 +162,7 @@ def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> Non
                 f"`{command('race', 'resume', path)}`, or choose another directory with "
                 "`--run-dir`."
             )
-    described = describe(task) | _tried(config.task, task)
+    described = describe(task) | tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
 
@@ -180,7 +193,8 @@ def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None
     )
 
 
-def _name(config: Config) -> str:
+def name_of(config: Config) -> str:
+    """What a run is called after: its task, method and ablations."""
     task = config.task.replace("/", "-").replace(":", "-")
     method = config.method.replace("(", "-").replace(")", "").lower()
     return "-".join([task, method, *config.ablation])

@@ -402,8 +402,8 @@ def _build(cls: Any, data: Any) -> Any:
         if dataclasses.is_dataclass(hints[name]):
             values[name] = _build(hints[name], value)
             continue
-        values[name] = _tuple(value)
-        if not _fits(values[name], hints[name]):
+        values[name] = tupled(value)
+        if not fits(values[name], hints[name]):
             raise ConfigError(
                 f"The saved configuration has {name} {value!r}, which is not what this version of "
                 "race understands by it."
@@ -411,21 +411,23 @@ def _build(cls: Any, data: Any) -> Any:
     return cls(**values)
 
 
-def _tuple(value: Any) -> Any:
-    return tuple(_tuple(v) for v in value) if isinstance(value, list) else value
+def tupled(value: Any) -> Any:
+    """Lists as tuples, also within lists."""
+    return tuple(tupled(v) for v in value) if isinstance(value, list) else value
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of a field's type; a whole number is a float, too."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return value in arguments
     if origin in (UnionType, Union):
-        return any(_fits(value, argument) for argument in arguments)
+        return any(fits(value, argument) for argument in arguments)
     if origin is tuple:
         if not isinstance(value, tuple):
             return False
         items = arguments[:1] * len(value) if arguments[-1] is Ellipsis else arguments
-        return len(items) == len(value) and all(map(_fits, value, items))
+        return len(items) == len(value) and all(map(fits, value, items))
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return type(value) is (hint or type(None))

@@ -15,7 +15,7 @@ from whole_runs import rows
 
 from race.cli import fleet
 from race.cli.fleet import directories_of
-from race.cli.seeds import parse_seeds
+from race.config.seeds import parse_seeds
 from race.errors import ConfigError
 from race.runs import directory as run_directory
 

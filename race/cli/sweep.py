@@ -1,0 +1,177 @@
+"""``race sweep``."""
+
+import os
+import re
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from race.config.cohort import CohortConfig
+from race.errors import ConfigError, RunDirectoryError, command
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """Train many runs: every combination of the settings in a file, or some drawn at random.
+
+    The file is TOML with the settings of `race train` by their names. A list means that each of its
+    values is tried:
+
+        task = "micro/2s3z"
+        algo = ["race", "facmac"]
+        seeds = "1-5"
+        env_steps = 200_000
+        [facmac]
+        actor_learning_rate = [3e-4, 1e-3]
+
+    With [sweep] draws = 20 so many combinations are drawn, and a number may be a range to draw
+    from, such as { from = 1e-4, to = 1e-2, scale = "log" }. Given again, the same command goes on
+    with what is unfinished.
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE.toml")]
+    """The settings."""
+    run_dir: Path | None = None
+    """Where the runs are kept. Default: runs/NAME, after the file."""
+    dry_run: bool = False
+    """Say what would be run, and run nothing."""
+    jobs: int | None = None
+    """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    cohort: CohortConfig = field(default_factory=CohortConfig)
+
+
+def main(arguments: list[str]) -> None:
+    """Parses the arguments, makes the run directories and trains."""
+    chosen = tyro.cli(Sweep, args=arguments, prog="race sweep")
+    from race.cli.fleet import check_jobs, run_all
+    from race.cli.worker import SHARED_ACCELERATOR
+    from race.compilation import use_cache
+
+    check_jobs(chosen.jobs)
+    os.environ.update(SHARED_ACCELERATOR)  # this process only watches
+    use_cache()
+    runs = _planned(_read(chosen.file))
+    path = chosen.run_dir or Path("runs") / chosen.file.stem
+    if chosen.dry_run:
+        _show(path, runs, chosen)
+        return
+    _create(path, runs)
+    run_all(path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort)
+
+
+def _read(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text())
+    except OSError as error:
+        raise ConfigError(f"{file} cannot be read: {error.strerror}.") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{file} is no TOML: {error}.") from error
+
+
+def _planned(description: dict[str, Any]) -> dict[str, Any]:
+    """The resolved configurations by the names of their directories."""
+    from race.cli.train import settled
+    from race.config.grid import points, read_grid, with_seed
+    from race.envs import make_task
+
+    grid, tasks, runs = read_grid(description), {}, {}
+    for point in points(grid):
+        asked = point.asked
+        key = (asked.task, asked.env)
+        if key not in tasks:
+            tasks[key] = make_task(*key)
+        told = ", ".join(f"{name} = {value}" for name, value in point.varied.items())
+        try:
+            config = settled(asked, point.preset, point.ablation, tasks[key])  # type: ignore[arg-type]
+        except ConfigError as error:
+            raise ConfigError(f"With {told or 'these settings'}: {error}") from error
+        for seed in grid.seeds:
+            runs[f"{_name(config, point.varied)}-seed{seed}"] = with_seed(config, seed)
+    return runs
+
+
+def _name(config: Any, varied: dict[str, Any]) -> str:
+    """What tells a combination from the others, in a directory's name."""
+    from race.cli.train import name_of
+
+    settings = [
+        f"{name.rpartition('.')[2]}={value:.6g}"
+        if isinstance(value, float)
+        else f"{name.rpartition('.')[2]}={value}"
+        for name, value in varied.items()
+        if name not in ("task", "algo", "base", "ablation")
+    ]
+    plain = "-".join([name_of(config), *settings])
+    return re.sub(r"[^\w.=+-]+", "_", plain).strip("_")
+
+
+def _create(path: Path, runs: dict[str, Any]) -> None:
+    """Makes the run directories that are not there, or none if one that is there is another."""
+    from race.cli.train import tried
+    from race.envs import make_task
+    from race.envs.description import describe
+    from race.runs import directory as run_directory
+
+    missing = {}
+    for name, config in runs.items():
+        if not (path / name / "config.json").exists():
+            missing[name] = config
+        elif run_directory.open_run(path / name) != config:
+            raise RunDirectoryError(
+                f"{path / name} holds a run with other settings than the file's. Choose another "
+                f"directory with --run-dir, or go on with the runs as they are: "
+                f"{command('race', 'resume', path)}"
+            )
+    described: dict[Any, Any] = {}
+    for name, config in missing.items():
+        key = (config.task, config.env)
+        if key not in described:
+            task = make_task(*key)
+            described[key] = describe(task) | tried(config.task, task)
+        run_directory.create(path / name, config, described[key])
+
+
+def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:
+    from race.cli import streams
+    from race.cli.fleet import accelerators, crews
+    from race.cli.worker import Watched
+    from race.runs import directory as run_directory
+
+    console = streams.console()
+    watched = [Watched(path / name, config) for name, config in runs.items()]
+    groups = crews(watched, chosen.cohort.batching, chosen.cohort.width, accelerators())
+    longest = max(map(len, runs))
+    console.print(f"{'run':<{longest}}  process       steps   replay  state", soft_wrap=True)
+    sizes: dict[Any, int] = {}
+    for number, group in enumerate(groups, 1):
+        for run in group:
+            config = run.config
+            key = (config.task, config.env, config.env_steps, repr(config.learner), config.facmac)
+            if key not in sizes:
+                sizes[key] = _replay_bytes(config)
+            there = run_directory.RunDirectory(run.path).config.exists()
+            state = run.ended or ("begun" if there else "new")
+            steps, size = f"{config.env_steps:,}", f"{sizes[key] / 1e9:.2f} GB"
+            line = f"{run.name:<{longest}}  {number:>7}  {steps:>10}  {size:>7}  {state}"
+            console.print(line, soft_wrap=True, highlight=False)
+    cohorts = f" in {len(groups)} processes" if len(groups) < len(watched) else ""
+    console.print(
+        f"{len(watched)} runs{cohorts}, {sum(r.config.env_steps for r in watched):,} environment "
+        f"steps, in {path}. Nothing was run.",
+        soft_wrap=True,
+    )
+
+
+def _replay_bytes(config: Any) -> int:
+    """Memory of a run's replay buffer."""
+    import jax
+
+    from race.envs import make_task
+    from race.rollouts import rollouts_of
+
+    with rollouts_of(config, make_task(config.task, config.env)) as rollouts:
+        shapes = jax.eval_shape(lambda: rollouts.empty_replay(config))
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
