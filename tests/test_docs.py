@@ -25,6 +25,7 @@ SMALL = {
     "plot": "",
     "archive": "",
     "show": "",
+    "sweep": "",
     "list": "",
     "doctor": "",
 }
@@ -64,6 +65,9 @@ def test_commands_in_documents_run(
         first = ["train", "mamujoco/HalfCheetah-2x3", "--run-dir", "runs/first"]
         if any("runs/first" in line for line in shown(document)):
             main([*small(first), "--env-steps", "7000"])
+    for block in re.findall(r"```toml\n(task = .*?)```", document.read_text(), re.DOTALL):
+        one = block.replace('["race", "matd3"]', '"matd3"').replace('"1-3"', '"1"')
+        Path("sweep.toml").write_text(one.replace("[1e-3, 3e-4]", "1e-3"))
     for line in shown(document):
         words = shlex.split(line)
         for word in words:
