@@ -104,7 +104,7 @@ def draw(
     return places, replay.data.length[places]
 
 
-@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
 def evolve(
     state: Any,
     fitness: Float[Array, "P"],
@@ -120,7 +120,7 @@ def evolve(
     return algorithm.evolve(state, fitness, key, spec, shape, hyper)
 
 
-@partial(jax.jit, static_argnames=("algorithm", "shape"))
+@partial(jax.jit, static_argnames=("algorithm", "shape"), donate_argnames="state")
 def inject(
     state: Any, key: PRNGKeyArray, *, hyper: Hyper, algorithm: Algorithm, shape: Shape
 ) -> Any:

@@ -14,10 +14,10 @@ from race.config.cohort import Batching
 from race.config.settings import Config
 from race.config.shape import shape_of
 from race.errors import DivergenceError
-from race.training.generation import evolve, inject, noted, owed, test, test_due, to_play
+from race.training.generation import evolve, inject, noted, owed, test, to_play
 from race.training.learning import learn, learn_together
 from race.training.run import Run
-from race.training.run_state import RunState
+from race.training.run_state import RunState, test_due
 
 
 def kind_of(config: Config) -> tuple[Any, ...]:
@@ -38,7 +38,8 @@ class _Piece(IntEnum):
 
     LEARN = 0
     END = 1
-    ROLL_OUT = 2
+    TEST = 2
+    ROLL_OUT = 3
 
 
 def together(batching: Batching, count: int) -> bool:
@@ -51,7 +52,7 @@ def together(batching: Batching, count: int) -> bool:
 def advance(
     runs: Sequence[Run], states: Sequence[RunState], active: Sequence[bool], *, as_one: bool
 ) -> list[RunState | DivergenceError]:
-    """The next piece of a generation: its beginning, some of its gradient steps, or its end.
+    """The next piece of a generation: its beginning, some gradient steps, its end, or a test.
 
     Between any two pieces runs can be saved and resumed. Comments name the lines of Algorithm 1.
 
@@ -79,12 +80,17 @@ def advance(
             learn(run, state) if here else state
             for run, state, here in zip(runs, states, chosen, strict=True)
         ]
-    return _end(runs, states, chosen, as_one)  # 11
+    if piece == _Piece.TEST:
+        return _test(runs, states, chosen, as_one)
+    return [
+        inject(run, state) if here else state  # 11
+        for run, state, here in zip(runs, states, chosen, strict=True)
+    ]
 
 
 def _next(run: Run, state: RunState) -> _Piece:
     if not state.progress.learning:
-        return _Piece.ROLL_OUT
+        return _Piece.TEST if test_due(run.config, state.progress) else _Piece.ROLL_OUT
     return _Piece.LEARN if owed(run.config, state.progress) > 0 else _Piece.END
 
 
@@ -110,17 +116,14 @@ def _roll_out(
     return after
 
 
-def _end(
+def _test(
     runs: Sequence[Run], states: Sequence[RunState], chosen: Sequence[bool], as_one: bool
 ) -> list[RunState | DivergenceError]:
-    """Line 11, and tests where they are due."""
-    after = [
-        inject(run, state) if here else state
-        for run, state, here in zip(runs, states, chosen, strict=True)
-    ]
-    tested = [c for c, here in enumerate(chosen) if here and test_due(runs[c], after[c])]
-    for group in [tested] if as_one and tested else [[c] for c in tested]:
-        found = test([runs[c] for c in group], [after[c] for c in group])
+    """Test episodes: a piece of its own, so that what came before is safe if one fails."""
+    after: list[RunState | DivergenceError] = list(states)
+    tested = [c for c, here in enumerate(chosen) if here]
+    for group in [tested] if as_one else [[c] for c in tested]:
+        found = test([runs[c] for c in group], [states[c] for c in group])
         for c, state in zip(group, found, strict=True):
             after[c] = state
-    return list(after)
+    return after

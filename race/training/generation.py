@@ -135,14 +135,6 @@ def inject(run: Run, state: RunState) -> RunState:
     return state._replace(algorithm=algorithm, losses=losses, progress=progress)
 
 
-def test_due(run: Run, state: RunState) -> bool:
-    """Whether a test comes after this generation."""
-    every, progress = run.config.evaluation.every, state.progress
-    assert every is not None
-    passed = progress.env_steps // every > progress.evaluated_at // every
-    return passed or progress.env_steps >= run.config.env_steps
-
-
 def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
     """Plays the test episodes of some runs and writes their rows."""
     groups: list[list[Trial]] = []

@@ -12,9 +12,8 @@ from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.training.cohort import advance
 from race.training.generation import warm_up
-from race.training.opening import is_over
 from race.training.run import Run
-from race.training.run_state import Progress, RunState
+from race.training.run_state import Progress, RunState, is_over
 from race.training.saving import save
 
 Results = dict[int, Progress | RaceError]

@@ -20,7 +20,7 @@ from race.training.clock import Clock
 from race.training.interrupts import Interrupts
 from race.training.records import lost_row
 from race.training.run import Report, Run, silent
-from race.training.run_state import Progress, RunState, fresh
+from race.training.run_state import Progress, RunState, fresh, is_over
 from race.training.saving import (
     check_owner,
     check_version,
@@ -122,11 +122,6 @@ def begin(
             save(run, state)  # the checkpoints before know of other rows
         files.enter_context(opened.pop_all())
     return run, state
-
-
-def is_over(config: Config, progress: Progress) -> bool:
-    """Whether the budget is used up and the last generation complete."""
-    return progress.env_steps >= config.env_steps and not progress.learning
 
 
 def _must_go_on(order: Order, progress: Progress) -> bool:

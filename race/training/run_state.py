@@ -74,6 +74,23 @@ class Progress:
         return dataclasses.replace(self, **changes)
 
 
+def test_due(config: Config, progress: Progress) -> bool:
+    """Whether a test is what comes next, after a generation."""
+    every = config.evaluation.every
+    assert every is not None
+    if progress.learning or progress.generation == 0:
+        return False
+    passed = progress.env_steps // every > progress.evaluated_at // every
+    last = progress.env_steps >= config.env_steps
+    return passed or (last and progress.evaluated_at < progress.env_steps)
+
+
+def is_over(config: Config, progress: Progress) -> bool:
+    """Whether the budget is used up, the last generation complete and its teams tested."""
+    made = progress.env_steps >= config.env_steps and not progress.learning
+    return made and not test_due(config, progress)
+
+
 class RunState(NamedTuple):
     """All of a run that changes."""
 

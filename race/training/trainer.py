@@ -21,9 +21,9 @@ from race.runs.directory import RunDirectory
 from race.training.cohort import kind_of, together
 from race.training.interrupts import Interrupts
 from race.training.lockstep import Member, Results, lockstep, released
-from race.training.opening import Order, begin, is_over
+from race.training.opening import Order, begin
 from race.training.run import Report, silent
-from race.training.run_state import Progress
+from race.training.run_state import Progress, is_over
 
 __all__ = ["Order", "is_over", "train", "train_cohort"]
 
