@@ -98,7 +98,8 @@ def explained(config: Config, batch: Laid) -> Explained:
             fitting.append((team, *y))
     ((team, y_marl, y_team),) = fitting
     critic = float64(got.after.critics.critic.params)
-    first, second = got.draws.noise
+    # The same noise may be drawn more than once, where gradients go two ways.
+    first, second = {noise.tobytes(): noise for noise in got.draws.noise}.values()
     orders = []
     for own, other in ((first, second), (second, first)):
         marl_s = sampled(policies.encoder, policies.head, episodes, of_steps(batch, own))

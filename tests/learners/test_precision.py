@@ -18,6 +18,7 @@ from race.method.equations import marl_policy_loss, td_loss
 from race.replay.buffer import Layout, Replay, slots_of
 from race.replay.packing import layouts
 from race.rollouts.device import play
+from race.rollouts.episodes import Part
 from race.types import Episode
 
 EPISODES = 6
@@ -36,7 +37,8 @@ def gradients() -> dict[str, Any]:
     state = race.init(jax.random.key(0), spec, shape_of(config), hyper_of(config))
     seeds = np.arange(EPISODES, dtype=np.uint32)
     teams = race.teams(state, spec, shape_of(config))
-    exact = play(device(), teams, seeds, None, spec, "float32").episodes
+    (played,) = play(device(), [Part(teams, seeds, None)], spec, "float32")
+    exact = played.episodes
     places = np.arange(EPISODES)[None]
     laid = layouts(places, np.asarray(exact.length)[None], spec.episode_limit)
     layout = Layout(*(jnp.asarray(column[0]) for column in laid))

@@ -170,7 +170,7 @@ def test_policy_embedding_averages_over_actions(tiny_spec: EnvSpec, head: Any) -
 
 
 def test_mine_scores_every_pair(tiny_spec: EnvSpec, state: jax.Array) -> None:
-    mine = init_mine(jax.random.key(6), tiny_spec, H, 6)
+    mine = init_mine(jax.random.key(6), tiny_spec, H, 6, tiny_spec.n_agents)
     z = jax.random.normal(jax.random.key(7), (2, B, H))
     scores = mine_scores(mine, state, z)
     w, s, z64 = float64(mine), float64(state), float64(z)

