@@ -6,12 +6,12 @@ Each agent of each team has an encoder and a head of its own, of the base method
 from typing import Any, NamedTuple
 
 import jax
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested
-from race.algorithms.evolutions import evolve as evolve_population
+from race.algorithms.evolutions import evolve_state
 from race.algorithms.evolutions import start as start_population
-from race.algorithms.population import Population
+from race.algorithms.population import Population, population_of
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
@@ -54,18 +54,6 @@ def tested(state: EaState, spec: Spec) -> tuple[Tested, ...]:
     return (Tested(encoder, {"champion": heads}),)
 
 
-def evolve(
-    state: EaState,
-    fitness: Float[Array, "P"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> EaState:
-    """The next generation."""
-    return EaState(evolve_population(state.population, fitness, key, spec, shape, hyper))
-
-
 def _update(
     state: EaState,
     batch: Any,
@@ -82,18 +70,14 @@ def _inject(state: EaState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> Ea
     return state
 
 
-def _population(state: EaState) -> Population:
-    return state.population
-
-
 ea = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve,
+    evolve=evolve_state,
     update=_update,
     inject=_inject,
-    population=_population,
+    population=population_of,
     critic_losses=(),
     policy_losses=(),
 )

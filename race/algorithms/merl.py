@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested
 from race.algorithms.ea import whole_teams
-from race.algorithms.evolutions import evolve as evolve_population
+from race.algorithms.evolutions import evolve_state
 from race.algorithms.marl import MarlState, heads_of, marl
-from race.algorithms.population import Population, inject_team
+from race.algorithms.population import Population, inject_team, population_of
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
@@ -57,19 +57,6 @@ def tested(state: MerlState, spec: Spec) -> tuple[Tested, ...]:
     return *marl.tested(state.marl, spec), Tested(encoder, {"champion": heads})
 
 
-def evolve(
-    state: MerlState,
-    fitness: Float[Array, "P"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> MerlState:
-    """The next generation."""
-    evolved = evolve_population(state.population, fitness, key, spec, shape, hyper)
-    return state._replace(population=evolved)
-
-
 def update(
     state: MerlState,
     batch: Any,
@@ -90,18 +77,14 @@ def inject_marl(state: MerlState, key: PRNGKeyArray, shape: Shape, hyper: Hyper)
     return state._replace(population=entered)
 
 
-def _population(state: MerlState) -> Population:
-    return state.population
-
-
 merl = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve,
+    evolve=evolve_state,
     update=update,
     inject=inject_marl,
-    population=_population,
+    population=population_of,
     critic_losses=marl.critic_losses,
     policy_losses=marl.policy_losses,
 )

@@ -30,6 +30,12 @@ class Population(NamedTuple):
     memory: Any  # what the evolution remembers besides the teams
 
 
+def population_of(state: Any) -> Population:
+    """That of an algorithm's state which has one."""
+    found: Population = state.population
+    return found
+
+
 def new_population(teams: Team, memory: Any) -> Population:
     """A population that has not played yet."""
     size, n_agents = teams.heads.shape[:2]

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested, when
-from race.algorithms.evolutions import evolve as evolve_population
+from race.algorithms.evolutions import evolve_state
 from race.algorithms.evolutions import start as start_population
-from race.algorithms.population import Population, inject_team
+from race.algorithms.population import Population, inject_team, population_of
 from race.algorithms.race_update import (
     CRITIC_LOSSES,
     POLICY_LOSSES,
@@ -90,19 +90,6 @@ def _marl_team(state: RaceState) -> Float[Array, "N H1 A"]:
     return jnp.broadcast_to(state.policies.head.params, state.heads.shape[1:])
 
 
-def evolve(
-    state: RaceState,
-    fitness: Float[Array, "P"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> RaceState:
-    """Line 9."""
-    evolved = evolve_population(state.population, fitness, key, spec, shape, hyper)
-    return state._replace(population=evolved)
-
-
 def update(
     state: RaceState,
     batch: Any,
@@ -161,18 +148,14 @@ def tested(state: RaceState, spec: Spec) -> tuple[Tested, ...]:
     return (Tested(state.policies.encoder.params, heads),)
 
 
-def _population(state: RaceState) -> Population:
-    return state.population
-
-
 race = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve,
+    evolve=evolve_state,
     update=update,
     inject=inject_marl,
-    population=_population,
+    population=population_of,
     critic_losses=CRITIC_LOSSES,
     policy_losses=POLICY_LOSSES,
 )

@@ -26,6 +26,7 @@ from race.config.presets import resolve
 from race.errors import ConfigError, RunDirectoryError, command
 from race.runs import directory as run_directory
 from race.training.cohort import kind_of
+from race.training.interrupts import Handlers, give_back, listen
 
 LOOK_EVERY = 0.5
 """Seconds between two looks at the runs."""
@@ -41,6 +42,17 @@ def check_jobs(jobs: int | None) -> None:
     """
     if jobs is not None and jobs < 1:
         raise ConfigError(f"--jobs is {jobs}, but it must be at least 1.")
+
+
+def refuse_for_one_run(jobs: int | None, cohort: CohortConfig, told: str) -> None:
+    """Refuses settings that are for several runs, where there is one.
+
+    Raises:
+        ConfigError: naming the first that was given; ``told`` says where it has no effect.
+    """
+    for option, given in (("jobs", jobs is not None), ("cohort.*", cohort != CohortConfig())):
+        if given:
+            raise ConfigError(f"--{option} has no effect {told}")
 
 
 def directories_of(path: Path) -> list[Path]:
@@ -59,13 +71,10 @@ class _Signals:
     def __init__(self, workers: Sequence[Worker]) -> None:
         self.requested = False
         self._workers = workers
-        self._previous: dict[int, Any] = {}
+        self._previous: Handlers = {}
 
     def __enter__(self) -> "_Signals":
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
-                continue  # as under nohup
-            self._previous[number] = signal.signal(number, self._pass_on)
+        self._previous = listen(self._pass_on)
         return self
 
     def __exit__(
@@ -74,8 +83,7 @@ class _Signals:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        for number, handler in self._previous.items():
-            signal.signal(number, handler)
+        give_back(self._previous)
         for worker in self._workers:  # none is left where all went well
             if worker.process is not None:
                 worker.process.terminate()

@@ -35,7 +35,7 @@ class Resume:
 def main(arguments: list[str]) -> None:
     """Parses the arguments and trains."""
     chosen = tyro.cli(Resume, args=arguments, prog="race resume")
-    from race.cli.fleet import directories_of, run_all
+    from race.cli.fleet import directories_of, refuse_for_one_run, run_all
     from race.cli.training import run
     from race.errors import ConfigError
     from race.runs import directory as run_directory
@@ -52,9 +52,7 @@ def main(arguments: list[str]) -> None:
             cohort=chosen.cohort,
         )
         return
-    for option, given in (("jobs", chosen.jobs), ("cohort.*", chosen.cohort != CohortConfig())):
-        if given is not None and given is not False:
-            raise ConfigError(f"--{option} has no effect on {chosen.run_dir}, which is one run.")
+    refuse_for_one_run(chosen.jobs, chosen.cohort, f"on {chosen.run_dir}, which is one run.")
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))

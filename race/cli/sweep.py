@@ -75,6 +75,7 @@ def _planned(description: dict[str, Any]) -> dict[str, Any]:
     """The resolved configurations by the names of their directories."""
     from race.cli.train import settled
     from race.config.grid import points, read_grid, with_seed
+    from race.config.presets import resolve
     from race.envs import make_task
 
     grid, tasks, runs = read_grid(description), {}, {}
@@ -89,7 +90,7 @@ def _planned(description: dict[str, Any]) -> dict[str, Any]:
         except ConfigError as error:
             raise ConfigError(f"With {told or 'these settings'}: {error}") from error
         for seed in grid.seeds:
-            runs[f"{_name(config, point.varied)}-seed{seed}"] = with_seed(config, seed)
+            runs[f"{_name(config, point.varied)}-seed{seed}"] = resolve(with_seed(config, seed))
     return runs
 
 

@@ -82,7 +82,7 @@ def main(arguments: list[str]) -> None:
         }
     )
     # Not before the arguments are parsed: these take a second to import.
-    from race.cli.fleet import directories_of, run_all
+    from race.cli.fleet import directories_of, refuse_for_one_run, run_all
     from race.cli.training import run
     from race.cli.worker import SHARED_ACCELERATOR
     from race.compilation import use_cache
@@ -96,9 +96,7 @@ def main(arguments: list[str]) -> None:
     task = make_task(asked.task, asked.env)
     config = settled(asked, chosen.preset, chosen.ablation, task)
     if chosen.seeds is None:
-        for option, given in (("jobs", chosen.jobs), ("cohort.*", chosen.cohort != CohortConfig())):
-            if given:
-                raise ConfigError(f"--{option} has no effect without --seeds. Leave it out.")
+        refuse_for_one_run(chosen.jobs, chosen.cohort, "without --seeds. Leave it out.")
         path = chosen.run_dir or Path("runs") / f"{name_of(config)}-seed{config.seed}"
         run_directory.refuse_occupied(path)
         run_directory.create(path, config, describe(task) | tried(asked.task, task))

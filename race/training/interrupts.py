@@ -2,8 +2,32 @@
 
 import signal
 import threading
+from collections.abc import Callable
 from types import FrameType, TracebackType
 from typing import Any, final
+
+Handlers = dict[int, Any]
+"""Handlers of signals, by their numbers."""
+
+
+def listen(handler: Callable[[int, FrameType | None], None]) -> Handlers:
+    """Hands SIGINT, SIGTERM and SIGHUP to ``handler``; returns who had them before.
+
+    What is ignored, as SIGHUP under ``nohup``, stays so.
+    """
+    previous: Handlers = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
+            continue
+        previous[number] = signal.signal(number, handler)
+    return previous
+
+
+def give_back(previous: Handlers) -> None:
+    """Gives the signals back to those who had them, once."""
+    while previous:
+        number, handler = previous.popitem()
+        signal.signal(number, handler)
 
 
 @final
@@ -16,14 +40,11 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.requested = False
-        self._previous: dict[int, Any] = {}
+        self._previous: Handlers = {}
 
     def __enter__(self) -> "Interrupts":
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                if number == signal.SIGHUP and signal.getsignal(number) == signal.SIG_IGN:
-                    continue  # as under nohup
-                self._previous[number] = signal.signal(number, self._request)
+            self._previous = listen(self._request)
         return self
 
     def __exit__(
@@ -32,13 +53,8 @@ class Interrupts:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        self._restore()
+        give_back(self._previous)
 
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
-        self._restore()
-
-    def _restore(self) -> None:
-        while self._previous:
-            number, handler = self._previous.popitem()
-            signal.signal(number, handler)
+        give_back(self._previous)

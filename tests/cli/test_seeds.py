@@ -99,6 +99,7 @@ def test_bad_input(both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert not (both / "seed3").exists()
     assert "two ways" in fails(f"{train} --seeds 1-2 --seed 4", capsys)
     assert "no effect without --seeds" in fails(f"{train} --jobs 2", capsys)
+    assert "no effect without --seeds" in fails(f"{train} --jobs 0", capsys)
     assert "at least 1" in fails(f"{train} --seeds 1-2 --jobs 0", capsys)
     assert "at least 1" in fails(f"resume {both} --jobs -1 --env-steps 900", capsys)
     assert "which is one run" in fails(f"resume {both / 'seed1'} --jobs 2", capsys)

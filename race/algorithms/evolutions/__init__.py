@@ -51,4 +51,17 @@ def evolve(
     return evolution_of(shape.evolution).step(population, fitness, key, spec, shape, hyper)
 
 
-__all__ = ["EVOLUTIONS", "Evolution", "evolution_of", "evolve", "start"]
+def evolve_state(
+    state: Any,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    spec: Spec,
+    shape: Shape,
+    hyper: Hyper,
+) -> Any:
+    """The same for an algorithm's state that has a ``population``."""
+    evolved = evolve(state.population, fitness, key, spec, shape, hyper)
+    return state._replace(population=evolved)
+
+
+__all__ = ["EVOLUTIONS", "Evolution", "evolution_of", "evolve", "evolve_state", "start"]
