@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from race.envs.micro import combat, movement, opponent
+from race.envs.micro import combat, movement, opponent, pairs
 from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import NOBODY, Units
 from race.envs.micro.units import HEAL_RANGE
@@ -138,11 +138,11 @@ def game_loop(scenario: Scenario, units: Units, given: Orders, delays: Float[Any
         )
     idle_x, idle_y = jnp.concatenate([given.x, goal.x]), jnp.concatenate([given.y, goal.y])
     marches = jnp.concatenate([given.walks, enemy_target < 0])
-    there = jnp.hypot(idle_x - units.x, idle_y - units.y)
+    there = jnp.sqrt(jnp.square(idle_x - units.x) + jnp.square(idle_y - units.y))
     course = movement.Course(
         x=jnp.where(follows, units.x[target], idle_x),
         y=jnp.where(follows, units.y[target], idle_y),
         distance=jnp.where(follows, distance, jnp.where(marches, there, 0.0)),
     )
-    footing = movement.Footing(fights=fights | (scenario.speed <= 0), idle=course.distance <= 0)
+    footing = pairs.Footing(fights=fights | (scenario.speed <= 0), idle=course.distance <= 0)
     return movement.move(scenario, fought._replace(target=target), course, footing)

@@ -1,13 +1,13 @@
 """How units walk, keep apart and stay on their ground."""
 
 import math
+import operator
 from typing import Any, Final, NamedTuple
 
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from race.envs.micro.pairs import Footing, Step, larger, meet, over_others, smaller
 from race.envs.micro.scenario import Scenario
 from race.envs.micro.state import Units
 from race.envs.micro.terrain import EAST, NORTH, SOUTH, WEST
@@ -37,22 +37,6 @@ class Course(NamedTuple):
     y: Float[Any, "U"]
     distance: Float[Any, "U"]
     """How far it wants to go towards (x, y); 0 to stay."""
-
-
-class Footing(NamedTuple):
-    """How firmly units stand against others that walk into them."""
-
-    fights: Bool[Any, "U"]
-    """Units in an attack hold their place."""
-    idle: Bool[Any, "U"]
-    """Idle units make way for friends and not for enemies."""
-
-
-class Step(NamedTuple):
-    """A game loop's step of each unit."""
-
-    x: Float[Any, "U"]
-    y: Float[Any, "U"]
 
 
 def move(scenario: Scenario, units: Units, course: Course, footing: Footing) -> Units:
@@ -163,76 +147,19 @@ def _next_detour(
     return jnp.where(stuck, other, left)
 
 
-class _Pairs(NamedTuple):
-    """Each unit i (columns) and each j whom it may meet (rows).
-
-    All but the distance is multiplied by the distance of the two, which spares divisions.
-    """
-
-    x: Float[Any, "U U"]
-    """From i to j, as long as their distance."""
-    y: Float[Any, "U U"]
-    square: Float[Any, "U U"]
-    """Of the distance."""
-    distance: Float[Any, "U U"]
-    meets: Float[Any, "U U"]
-    """By how much the step of i brings it nearer to j."""
-    gives: Float[Any, "U U"]
-    """By how much the step of j brings it away from i."""
-    leads: Float[Any, "U U"]
-    """By how much it does so for sure: who did not go in the last loop may not go in this one."""
-    firmer: Float[Any, "U U"]
-    """Share of a gap, beyond half of it, that is left to i because j stands more firmly."""
-
-
-def _pairs(scenario: Scenario, units: Units, step: Step, footing: Footing) -> _Pairs:
-    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
-    # The dead are put out of everyone's way.
-    x = jnp.where(units.health > 0, units.x, 1000.0 + 10.0 * everyone.astype(jnp.float32))
-    with_friends = jnp.where(footing.fights, 0.5, 0.0)
-    with_enemies = jnp.where(footing.fights | footing.idle, 0.5, 0.0)
-    # Without the barrier the compiler works these out again for every pair of units.
-    x, with_friends, with_enemies, step = jax.lax.optimization_barrier(
-        (x, with_friends, with_enemies, step)
-    )
-    dx, dy = x[:, None] - x[None], units.y[:, None] - units.y[None]
-    gives = step.x[:, None] * dx + step.y[:, None] * dy
-    last = units.vx[:, None] * dx + units.vy[:, None] * dy
-    side = everyone < n
-    square = _larger(dx * dx + dy * dy, 1e-3)
-    return _Pairs(
-        x=dx,
-        y=dy,
-        square=square,
-        distance=jnp.sqrt(square),
-        meets=step.x[None] * dx + step.y[None] * dy,
-        gives=gives,
-        leads=_larger(_smaller(gives, last), 0.0),
-        firmer=jnp.where(
-            side[:, None] == side[None],
-            with_friends[:, None] - with_friends[None],
-            with_enemies[:, None] - with_enemies[None],
-        ),
-    )
-
-
 def _round_others(scenario: Scenario, units: Units, own: Step, footing: Footing) -> Step:
     """Takes off a step what others leave no room for, and goes aside instead."""
-    n, everyone = scenario.shape.n_allies, jnp.arange(scenario.shape.n_units)
-    pairs = _pairs(scenario, units, own, footing)
-    side, idle = everyone < n, footing.idle
-    makes_way = (side[:, None] == side[None]) & (idle & ~footing.fights)[None] & ~idle[:, None]
-    wants = pairs.meets + jnp.where(makes_way, 0.5 * _larger(-pairs.gives, 0.0), 0.0)
+    pairs = meet(scenario, units, own, footing)
     gap = pairs.square - scenario.contact * pairs.distance
-    excess = _larger(wants - (0.5 + pairs.firmer) * gap - pairs.leads, 0.0)
+    wants = pairs.meets + jnp.where(pairs.makes_way, 0.5 * larger(-pairs.gives, 0.0), 0.0)
+    excess = larger(wants - (0.5 + pairs.firmer) * gap - pairs.leads, 0.0)
     if scenario.shape.flyers:
-        excess += AIR_DRIFT * _larger(scenario.air_contact * pairs.distance - pairs.square, 0.0)
-    # With the barriers the division is done for many pairs at once, and only once.
-    push = jax.lax.optimization_barrier(excess / pairs.square)
+        excess += AIR_DRIFT * larger(scenario.air_contact * pairs.distance - pairs.square, 0.0)
+    push = excess / pairs.square
     stays = footing.fights & ~scenario.flying
-    back_x = jnp.where(stays, 0.0, -jnp.sum(push * pairs.x, axis=0))
-    back_y = jnp.where(stays, 0.0, -jnp.sum(push * pairs.y, axis=0))
-    turn = jnp.where(footing.fights | idle | scenario.flying, 0.0, SWERVE)
+    back_x = jnp.where(stays, 0.0, -over_others(push * pairs.x, operator.add))
+    back_y = jnp.where(stays, 0.0, -over_others(push * pairs.y, operator.add))
+    turn = jnp.where(footing.fights | footing.idle | scenario.flying, 0.0, SWERVE)
     # On the side on which it already goes round.
     onwards = units.vy * back_x - units.vx * back_y
     turn = jnp.where(onwards >= 0, turn, -turn)
@@ -242,7 +169,7 @@ def _round_others(scenario: Scenario, units: Units, own: Step, footing: Footing)
     x = jnp.where(crowded, (1 - CARRY) * x + CARRY * units.vx, x)
     y = jnp.where(crowded, (1 - CARRY) * y + CARRY * units.vy, y)
     length = jnp.sqrt(x * x + y * y)
-    share = _smaller(1.0, scenario.speed / _larger(length, 1e-6))
+    share = smaller(1.0, scenario.speed / larger(length, 1e-6))
     return Step(x * share, y * share)
 
 
@@ -275,21 +202,11 @@ def _along_walls(scenario: Scenario, units: Units, step: Step) -> Step:
 
 def _free(scenario: Scenario, units: Units, step: Step, footing: Footing) -> Float[Any, "U"]:
     """The share of a step that leads too near to nobody."""
-    pairs = _pairs(scenario, units, step, footing)
-    gap = _larger(pairs.square - TIGHT * scenario.contact * pairs.distance, 0.0)
-    room = (0.5 + _larger(pairs.firmer, 0.0)) * gap + pairs.leads
-    needed = jax.lax.optimization_barrier(pairs.meets / _larger(room, 1e-6))
-    most = jax.lax.reduce(needed, np.float32(1.0), _larger, (0,))
-    return 1.0 / most
-
-
-def _larger(one: Any, other: Any) -> Any:
-    """The maximum where nothing is nan; not to look for it halves the time of all pairs."""
-    return jnp.where(one > other, one, other)
-
-
-def _smaller(one: Any, other: Any) -> Any:
-    return jnp.where(one < other, one, other)
+    pairs = meet(scenario, units, step, footing)
+    gap = larger(pairs.square - TIGHT * scenario.contact * pairs.distance, 0.0)
+    room = (0.5 + larger(pairs.firmer, 0.0)) * gap + pairs.leads
+    needed = over_others(pairs.meets / larger(room, 1e-6), larger)
+    return 1.0 / larger(needed, 1.0)
 
 
 def _cell(place: Float[Any, "U"]) -> Int[Any, "U"]:
