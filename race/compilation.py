@@ -1,11 +1,15 @@
-"""The persistent compilation cache: programs compiled once serve later processes."""
+"""How this process compiles and computes: the cache of programs, precision, determinism."""
 
 import os
 from pathlib import Path
 
 import jax
 
+from race.config.compute import ComputeConfig
 from race.errors import RaceError
+
+PRECISION = {"full": "highest", "tf32": "tensorfloat32"}
+DETERMINISTIC = "--xla_gpu_deterministic_ops=true"
 
 
 def cache_directory() -> Path:
@@ -32,13 +36,26 @@ def check_backend() -> None:
         ) from error
 
 
-def use_cache() -> None:
-    """Turns the cache on, unless JAX was given one already or the folder cannot be written.
+def use_cache(compute: ComputeConfig | None = None) -> None:
+    """Lets this process compute as a run asks for, and turns the cache of programs on.
+
+    The cache stays as it is if JAX was given one already, or the folder cannot be written. XLA
+    reads its flags when it first looks for devices: call this before anything is computed. What
+    ``XLA_FLAGS`` says already is kept.
+
+    Args:
+        compute: how an accelerator computes; None: as by default.
 
     Raises:
         RaceError: if JAX cannot compute here.
     """
+    compute = compute or ComputeConfig()
+    flags = os.environ.get("XLA_FLAGS", "")
+    if compute.deterministic and DETERMINISTIC not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {DETERMINISTIC}".strip()
     check_backend()
+    if jax.default_backend() != "cpu":  # where JAX itself would take tf32 for float32
+        jax.config.update("jax_default_matmul_precision", PRECISION[compute.matmul])
     if jax.config.jax_compilation_cache_dir is not None:  # type: ignore[attr-defined]
         return
     directory = cache_directory()

@@ -6,9 +6,12 @@ import platform
 import re
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
+
+import numpy as np
 
 from race import __version__
 from race.compilation import check_backend
@@ -91,9 +94,15 @@ def _accelerator() -> Finding:
             "accelerator",
             "warning",
             f"JAX uses {kinds}, though this machine has an NVIDIA driver",
-            "pip install 'jax[cuda12]'",
+            "pip install 'jax[cuda12]' (or 'jax[cuda13]', as the driver is)",
         )
-    return Finding("accelerator", "ok", f"JAX {jax.__version__} on {kinds}")
+    begin = time.perf_counter()
+    for device in devices:
+        square = jax.device_put(np.full((64, 64), 0.5, np.float32), device)
+        if not np.allclose(jax.jit(lambda x: x @ x)(square), 16.0):
+            return Finding("accelerator", "missing", f"{device} computes 64 x 64 products wrongly")
+    told = f"a small program ran on each in {time.perf_counter() - begin:.1f} s"
+    return Finding("accelerator", "ok", f"JAX {jax.__version__} on {kinds}; {told}")
 
 
 def _physics() -> Finding:

@@ -16,9 +16,9 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
         frozenset,
         (
             {"", "errors"},
-            {"compilation", "loading"},
+            {"loading"},
             {"config", "types"},
-            {"method", "randomness"},
+            {"compilation", "method", "randomness"},
             {"networks", "replay", "runs", "envs", "statistics"},
             {"learners"},
             {"algorithms"},

@@ -37,22 +37,24 @@ COMPILE_GOAL: Final = 15.0
 STEPS: Final = {1: 2000, 6: 600, 256: 24}
 """Steps of each battle in one measurement."""
 ROUNDS: Final = 5
+MANY: Final = 1024
+GOAL_MANY: Final = 1e6
+"""Steps per second of so many battles of 2s3z at once, on one H100 or H200."""
+STEPS_OF_MANY: Final = 60
 
 
 def subjects() -> list[Subject]:
     """Speed and kernels of every map; those of maps without goals only when they are asked for."""
-    return [
-        subject
-        for name in map_names()
-        for subject in (
-            Subject(_names(name), partial(measure, name), on_request=name not in GOALS),
-            Subject(
-                (_kernels_name(name),),
-                partial(measure_kernels, name),
-                on_request=name not in GOALS,
-            ),
-        )
-    ]
+    many = f"micro/2s3z/battles_{MANY}/steps_per_second"
+    found = [Subject((many,), partial(_measure_many, many), on_request=True)]
+    for name in map_names():
+        asked = name not in GOALS
+        kernels = _kernels_name(name)
+        found += [
+            Subject(_names(name), partial(measure, name), on_request=asked),
+            Subject((kernels,), partial(measure_kernels, name), on_request=asked),
+        ]
+    return found
 
 
 def _names(name: str) -> tuple[str, ...]:
@@ -83,7 +85,7 @@ def measure(name: str) -> list[Measurement]:
     for battles in BATTLES:
         key = jax.random.key(0)
         begin = time.perf_counter()
-        run = jax.jit(partial(_play, battle, battles)).lower(key).compile()
+        run = jax.jit(partial(_play, battle, battles, STEPS[battles])).lower(key).compile()
         compile_times.append(time.perf_counter() - begin)
         runs.append(partial(run, key))
     *rate_names, compile_name = _names(name)
@@ -101,7 +103,14 @@ def measure(name: str) -> list[Measurement]:
     return [*rates, Measurement(compile_name, max(compile_times), "s", COMPILE_GOAL)]
 
 
-def _play(battle: Battle, battles: int, key: Key[Array, ""]) -> Any:
+def _measure_many(name: str) -> list[Measurement]:
+    """Battles for an accelerator; on a processor they wait for each other."""
+    run = jax.jit(partial(_play, make("2s3z"), MANY, STEPS_OF_MANY))
+    (best,) = interleaved_best([partial(run, jax.random.key(0))], ROUNDS)
+    return [Measurement(name, MANY * STEPS_OF_MANY / best, "1/s", GOAL_MANY)]
+
+
+def _play(battle: Battle, battles: int, steps: int, key: Key[Array, ""]) -> Any:
     """Sums over all that the steps return, so that nothing of them is left out."""
 
     def one(key: Key[Array, ""]) -> Any:
@@ -121,6 +130,6 @@ def _play(battle: Battle, battles: int, key: Key[Array, ""]) -> Any:
             )
             return carry, (total, timestep.info)
 
-        return jax.lax.scan(step, fresh, jax.random.split(key, STEPS[battles]))
+        return jax.lax.scan(step, fresh, jax.random.split(key, steps))
 
     return one(key) if battles == 1 else jax.vmap(one)(jax.random.split(key, battles))

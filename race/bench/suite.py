@@ -3,14 +3,24 @@
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 
-from race.bench import environments, episodes, evolution, memory, micro, startup, training, update
+from race.bench import (
+    cohorts,
+    environments,
+    episodes,
+    evolution,
+    memory,
+    micro,
+    startup,
+    training,
+    update,
+)
 from race.bench.measurement import Measurement, Subject
 from race.errors import ConfigError
 
 
 def subjects() -> list[Subject]:
     """Everything that can be measured, in the order of the table."""
-    modules = (update, evolution, episodes, training, startup, memory, environments, micro)
+    modules = (update, cohorts, evolution, episodes, training, startup, memory, environments, micro)
     return [subject for module in modules for subject in module.subjects()]
 
 

@@ -61,9 +61,9 @@ class Updates:
         self.spec = make_continuous_task(config.task, config.env).spec
         self.algorithm = algorithm_of(config)
         self.replay = random_replay(self.spec, transitions)
-        self._statics = {"algorithm": self.algorithm, "spec": self.spec, "shape": shape_of(config)}
-        self._hyper = hyper_of(config)
-        self.state = programs.start(jax.random.key(0), hyper=self._hyper, **self._statics)
+        self.shape, self.hyper = shape_of(config), hyper_of(config)
+        self._statics = {"algorithm": self.algorithm, "spec": self.spec, "shape": self.shape}
+        self.state = programs.start(jax.random.key(0), hyper=self.hyper, **self._statics)
         self._sums = programs.empty_losses(self.algorithm)
 
     def __call__(self, steps: int) -> Any:
@@ -75,23 +75,21 @@ class Updates:
             jax.random.key(1),
             np.int32(0),
             np.int32(steps),
-            hyper=self._hyper,
+            hyper=self.hyper,
             **self._statics,
         )
         return self.state
 
     def hlo(self, step: int) -> str:
         """The compiled text of the gradient step of one number, all its conditions resolved."""
-        shape = shape_of(self.config)
+        shape = self.shape
 
         def update(state: Any, batch: Transition, key: jax.Array, hyper: Hyper) -> Any:
             number = jnp.int32(step)
             return self.algorithm.update(state, batch, number, key, self.spec, shape, hyper)
 
         batch = sample(self.replay, self.config.learner.batch_size, jax.random.key(2))
-        compiled = (
-            jax.jit(update).lower(self.state, batch, jax.random.key(3), self._hyper).compile()
-        )
+        compiled = jax.jit(update).lower(self.state, batch, jax.random.key(3), self.hyper).compile()
         text = compiled.as_text()
         assert text is not None, "this backend does not show its programs"
         return text

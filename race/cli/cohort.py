@@ -23,10 +23,10 @@ def main(arguments: list[str]) -> int:
     """Trains the runs of some directories in lockstep; returns the exit status."""
     batching, *places = arguments
     assert batching in get_args(Batching), batching
-    use_cache()
     paths = [Path(place) for place in places]
     try:
         orders = [Order(p, run_directory.open_run(p), report=_report(p)) for p in paths]
+        use_cache(orders[0].config.compute)  # runs of a cohort are alike
         results = train_cohort(orders, batching=cast(Batching, batching))
     except RaceError as error:
         say(f"race: {error}")

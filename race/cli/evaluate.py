@@ -55,9 +55,10 @@ def main(arguments: list[str]) -> None:
     from race.compilation import use_cache
     from race.rollouts import rollouts_of
     from race.rollouts.base import Score, Trial
+    from race.runs import directory as run_directory
     from race.teams.trained import load_trained
 
-    use_cache()
+    use_cache(run_directory.open_run(chosen.run_dir).compute)
     trained = load_trained(chosen.run_dir)
     name = trained.resolve(chosen.team)
     seeds = np.random.SeedSequence(chosen.seed).generate_state(chosen.episodes).astype(np.int64)

@@ -112,9 +112,9 @@ def _render_run(chosen: Render, out: Path) -> None:
     from race.runs import directory as run_directory
 
     console = streams.console(stderr=True)
-    discrete = run_directory.open_run(Path(chosen.what)).discrete
+    config = run_directory.open_run(Path(chosen.what))
     renderer = None
-    if not discrete:
+    if not config.discrete:
         # mujoco reads what is chosen here when it is imported.
         from race.viewing.rendering import choose_renderer
 
@@ -123,7 +123,7 @@ def _render_run(chosen: Render, out: Path) -> None:
         console.print(f"Drawing with: {renderer.reason}", soft_wrap=True)
     from race.teams.trained import load_trained
 
-    use_cache()
+    use_cache(config.compute)
     with console.status("loading the team"):
         trained = load_trained(Path(chosen.what))
     if renderer is None:

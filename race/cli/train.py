@@ -10,6 +10,7 @@ import tyro
 
 from race.config.ablations import AblationName, ablated
 from race.config.cohort import CohortConfig
+from race.config.compute import ComputeConfig
 from race.config.effects import refuse_without_effect
 from race.config.presets import PRESETS, resolve
 from race.config.settings import (
@@ -68,6 +69,7 @@ class Train:
     env: EnvConfig = field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
     cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
@@ -92,7 +94,7 @@ def main(arguments: list[str]) -> None:
 
     if chosen.seeds is not None:  # this process only watches
         os.environ.update(SHARED_ACCELERATOR)
-    use_cache()
+    use_cache(asked.compute)
     task = make_task(asked.task, asked.env)
     config = settled(asked, chosen.preset, chosen.ablation, task)
     if chosen.seeds is None:

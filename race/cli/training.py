@@ -17,7 +17,7 @@ def run(path: Path, config: Config, *, extend: bool = False, without_metrics: bo
     """Trains in an existing run directory and says how it ended. Exits with 130 on Ctrl-C."""
     import time
 
-    use_cache()
+    use_cache(config.compute)
     console = streams.console(tolerant=True)
     console.print(
         f"{config.method} on {config.task}, seed {config.seed}, in {path}", soft_wrap=True

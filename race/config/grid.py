@@ -19,7 +19,7 @@ from race.config.seeds import parse_seeds
 from race.config.settings import Config, fits, from_json, to_json, tupled
 from race.errors import ConfigError
 
-GROUPS = ("learner", "facmac", "race", "env", "evaluation", "checkpoint")
+GROUPS = ("learner", "facmac", "race", "env", "evaluation", "checkpoint", "compute")
 TOP = ("task", "algo", "base", "env_steps")
 MOST_RUNS = 10_000
 

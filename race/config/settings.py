@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import tyro
 
+from race.config.compute import ComputeConfig
 from race.errors import ConfigError
 
 Algo = Literal["race", "merl", "ea", "matd3", "maddpg", "facmac"]
@@ -291,6 +292,7 @@ class Config:
     env: EnvConfig = field(default_factory=EnvConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
 
     @property
     def has_population(self) -> bool:
@@ -376,6 +378,7 @@ _BEFORE: dict[str, Any] = {
     "marl_episodes": 1,
     "evolution_from": 0,
     "random_steps_owed": False,
+    "compute": ComputeConfig(),
 }
 
 

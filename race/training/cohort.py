@@ -30,6 +30,7 @@ def kind_of(config: Config) -> tuple[Any, ...]:
         config.n_marl_teams,
         config.evaluation.episodes,
         config.facmac.replay_precision,
+        config.compute,
     )
 
 
