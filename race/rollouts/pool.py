@@ -3,7 +3,7 @@
 import functools
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any, Final, final
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from race.envs.checked import CheckedEnv
 from race.envs.contract import Seen, Step
-from race.envs.worker import WorkerEnv
+from race.envs.worker import EnvProcess, Request
 from race.errors import EnvFailedError, TaskError, say
 from race.types import AnyTask, Task
 
@@ -22,6 +22,8 @@ _TIMED_STEPS: Final = 50
 # in this process.
 _TICK_OVERHEAD: Final = 160e-6
 _ENV_OVERHEAD: Final = 60e-6
+_MOST_PROCESSES: Final = 16
+"""Environments beyond so many, or the number of cores, share processes."""
 
 
 @final
@@ -29,8 +31,8 @@ class EnvPool:
     """Environments of one task, one for each of some teams; they are made when they are needed.
 
     In this process they are stepped one after the other; with processes, each environment has one
-    of its own. What they give is the same, to the bit. Use it in a ``with`` statement, or call
-    `close`.
+    of its own, or some share one where there are many. What they give is the same, to the bit. Use
+    it in a ``with`` statement, or call `close`.
 
     Worker processes start afresh and import what they need. A script that uses them needs the
     usual ``if __name__ == "__main__":``.
@@ -80,7 +82,8 @@ class EnvPool:
         self._asked, self._usual = processes, usual or size
         self._step_seconds = step_seconds
         self._here: dict[int, CheckedEnv] = {}
-        self._workers: dict[int, WorkerEnv] = {}
+        self._workers: dict[int, EnvProcess] = {}
+        self._together = -(-size // max(_MOST_PROCESSES, _cores()))  # of a process
 
     @functools.cached_property
     def processes(self) -> bool:
@@ -108,15 +111,12 @@ class EnvPool:
                 f"This pool has {self.size} environments, but {len(seeds)} were asked."
             )
         found = self._make(seeds)
-        for team, seed in seeds.items():
-            if team in self._workers and team not in found:
-                self._workers[team].ask_reset(seed)
-        for team, seed in seeds.items():
-            if team in found:
-                continue
+        here = {team: seed for team, seed in seeds.items() if team not in found}
+        self._ask("reset", here)
+        for team, seed in here.items():
             try:
                 worker = self._workers.get(team)
-                found[team] = worker.answer() if worker else self._here[team].reset(seed)
+                found[team] = worker.answer(team) if worker else self._here[team].reset(seed)
             except EnvFailedError as error:
                 found[team] = self._noted(team, error)
         return found
@@ -134,14 +134,12 @@ class EnvPool:
             EnvFailedError: if an environment fails whose episode is not to be repeated.
             HandedOverError: if what it answers breaks the contract.
         """
-        for team, action in actions.items():
-            if self.processes:
-                self._workers[team].ask_step(action)
+        self._ask("step", actions)
         found: dict[int, Step | EnvFailedError] = {}
         for team, action in actions.items():
             try:
                 worker = self._workers.get(team)
-                found[team] = worker.answer() if worker else self._here[team].step(action)
+                found[team] = worker.answer(team) if worker else self._here[team].step(action)
             except EnvFailedError as error:
                 found[team] = self._noted(team, error)
         return found
@@ -169,9 +167,12 @@ class EnvPool:
     def close(self) -> None:
         """Closes all environments and ends their processes; says what fails then."""
         failures: list[TaskError] = []
-        for envs in (self._here, self._workers):
-            while envs:
-                failures += _close(envs.popitem()[1])
+        open_ones: list[CheckedEnv | EnvProcess] = [*self._here.values()]
+        open_ones += dict.fromkeys(self._workers.values())
+        self._here.clear()
+        self._workers.clear()
+        while open_ones:
+            failures += _close(open_ones.pop().close)
         if failures:
             more = f" So did {len(failures) - 1} more." if len(failures) > 1 else ""
             say(f"{failures[0]}{more} What was done before is not affected.")
@@ -179,27 +180,48 @@ class EnvPool:
     def _make(self, teams: Mapping[int, int]) -> dict[int, Seen | EnvFailedError]:
         """Makes the missing environments of some teams; returns the errors."""
         found: dict[int, Seen | EnvFailedError] = {}
+        for team in [team for team, worker in self._workers.items() if worker.ended]:
+            del self._workers[team]
         missing = [t for t in teams if t not in self._here and t not in self._workers]
         if self.processes:
             for team in missing:
-                self._workers[team] = WorkerEnv(self.task, team, self._step_seconds)
+                self._workers[team] = self._process_for(team)
+            self._ask("make", dict.fromkeys(missing))
         for team in missing:
             try:
                 if self.processes:
-                    self._workers[team].answer()
+                    self._workers[team].answer(team)
                 else:
                     self._here[team] = CheckedEnv(self.task, team)
             except EnvFailedError as error:
                 found[team] = self._noted(team, error)
         return found
 
+    def _process_for(self, team: int) -> EnvProcess:
+        """The process of a team's neighbours, or a new one."""
+        first = team - team % self._together
+        beside = (self._workers.get(first + i) for i in range(self._together))
+        there = [worker for worker in beside if worker is not None]
+        return there[0] if there else EnvProcess(self.task, self._step_seconds)
+
+    def _ask(self, what: Request, values: Mapping[int, Any]) -> None:
+        """One message to each process."""
+        parts: dict[EnvProcess, dict[int, Any]] = {}
+        for team, value in values.items():
+            if team in self._workers:
+                parts.setdefault(self._workers[team], {})[team] = value
+        for worker, part in parts.items():
+            worker.ask(what, part)
+
     def _noted(self, team: int, error: EnvFailedError) -> EnvFailedError:
         """Puts the environment of a failure away."""
         if not self.proven or self.retries == 0:
             raise error
-        env = self._workers.pop(team, None) or self._here.pop(team, None)
+        worker, env = self._workers.pop(team, None), self._here.pop(team, None)
         if env is not None:
-            _close(env)
+            _close(env.close)
+        elif worker is not None and worker not in self._workers.values():
+            _close(worker.close)
         return error
 
     def __enter__(self) -> "EnvPool":
@@ -214,29 +236,37 @@ class EnvPool:
         self.close()
 
 
-def _close(env: CheckedEnv | WorkerEnv) -> list[TaskError]:
+def _close(close: Callable[[], None]) -> list[TaskError]:
     # An environment that cannot be closed must not hide what went wrong before, nor keep others
     # open, nor spoil a run that is complete.
     try:
-        env.close()
+        close()
     except TaskError as error:
         return [error]
     return []
 
 
+def _cores() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def _processes_pay(task: Task, size: int) -> bool:
     """Whether a tick takes clearly less time in processes (by a quarter or more).
 
-    Only with a core for each environment and one for the policies: with two cores, four
+    With a core for each environment and one for the policies, or several environments to each of
+    many cores: with two cores, four
     HumanoidStandups (0.4 ms a step) took 1.8 ms a tick in processes and 1.6 ms without. With
     enough cores, six environments pay from about 0.15 ms a step: Ant and the humanoids, but not
     HalfCheetah or Hopper.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    if size < 2 or (cores or 1) <= size:
+    workers = min(size, _cores() - 1)
+    if size < 2 or workers < 2 or (workers < size <= _MOST_PROCESSES):
         return False
     step = _seconds_per_step(task)
-    return _TICK_OVERHEAD + size * _ENV_OVERHEAD + step < 0.75 * size * step
+    longest = -(-size // workers) * step
+    return _TICK_OVERHEAD + size * _ENV_OVERHEAD + longest < 0.75 * size * step
 
 
 def _seconds_per_step(task: Task) -> float:
@@ -253,5 +283,5 @@ def _seconds_per_step(task: Task) -> float:
             if step.terminated or step.truncated:
                 env.reset(0)
     finally:
-        _close(env)
+        _close(env.close)
     return float(np.median(seconds))

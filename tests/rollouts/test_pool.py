@@ -18,6 +18,7 @@ from race.envs import factorised
 from race.errors import EnvFailedError, HandedOverError
 from race.learners.facmac import new_encoder
 from race.randomness import seed_again
+from race.rollouts import pool as pool_module
 from race.rollouts.host import collect
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
@@ -155,6 +156,32 @@ def test_processes_give_the_same(tasks: Callable[..., Any], fails: str) -> None:
         expected = shown(pool, [3, 4])
     for mine, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+@pytest.mark.slow
+@KINDS
+@pytest.mark.parametrize("fails", ["", "error", "dies"])
+def test_environments_share_processes_where_there_are_many(
+    tasks: Callable[..., Any], fails: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pool_module, "_MOST_PROCESSES", 2)
+    monkeypatch.setattr(pool_module, "_cores", lambda: 2)
+    with EnvPool(tasks(fails, 4), 5, True, retries=2, proven=True) as pool:
+        found = shown(pool, [3, 4, 5, 6, 7])
+        processes = {worker.process_id for worker in pool._workers.values()}
+        assert len(processes) == 2
+        # A process that dies takes its other environments with it.
+        assert pool.repeated == {"": 0, "error": 1, "dies": 3}[fails]
+        again = shown(pool, [8, 9])
+    fresh = {"": (), "error": (4,), "dies": (3, 4, 5)}[fails]
+    seeds = [seed_again(seed, 1) if seed in fresh else seed for seed in range(3, 8)]
+    with EnvPool(tasks(""), 5, False) as pool:
+        expected, expected_again = shown(pool, seeds), shown(pool, [8, 9])
+    continuous = isinstance(pool.task, Task)
+    for mine, theirs in ((found, expected), (again, expected_again)):
+        pairs = zip(in_order(mine, continuous), in_order(theirs, continuous), strict=True)
+        for one, other in pairs:
+            np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.slow
