@@ -103,13 +103,13 @@ class CheckedEnv:
             self._failed(error, self._where())
         try:
             observation, reward, terminated, truncated, info = contract.parts_of(answer)
-            won = info.get("battle_won", False) if self._wins else False
+            won = self._wins and contract.truth(info.get("battle_won", False), 'info["battle_won"]')
             return Step(
                 self._read(observation),
                 contract.payment(reward),
                 contract.truth(terminated, "terminated"),
                 contract.truth(truncated, "truncated"),
-                contract.truth(won, 'info["battle_won"]'),
+                won,
             )
         except HandedOverError as error:
             raise self._wrong(error, "step") from error

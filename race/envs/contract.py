@@ -77,10 +77,8 @@ def numbers(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32
             not finite or larger than `LARGEST`.
     """
     array = _array(value, shape, name)
-    flat = array.ravel()
-    with np.errstate(all="ignore"):
-        square = flat.dot(flat)
-    if not square <= LARGEST**2:  # the norm is no smaller than any entry
+    # The plain reduction takes half as long as `max`, and this is done at every step.
+    if not np.maximum.reduce(np.abs(array.ravel()), initial=0.0) <= LARGEST:
         for place in np.argwhere(~(np.abs(array) <= LARGEST)).tolist():
             entry = float(array[tuple(place)])
             where = place[0] if len(place) == 1 else tuple(place)
@@ -109,8 +107,8 @@ def truth(value: Any, name: str) -> bool:
     Raises:
         HandedOverError: for anything else, such as one value per agent.
     """
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
+    if value is True or value is False:
+        return value
     one = _single(value)
     if one in (0, 1):
         return bool(one)
@@ -128,7 +126,7 @@ def payment(value: Any) -> float:
     Raises:
         HandedOverError: for anything else, and for what is not finite or larger than `LARGEST`.
     """
-    one = value if type(value) is float else _single(value)
+    one = float(value) if isinstance(value, float) else _single(value)
     if one is None:
         raise HandedOverError(
             f"the reward is {came(value)}, but must be one number for the whole team. Add up what "
