@@ -15,11 +15,12 @@ import numpy as np
 from race import programs
 from race.algorithms import algorithm_of
 from race.bench.measurement import Measurement, Subject, interleaved_best
-from race.config.hyper import hyper_of
+from race.bench.products import Product, products_alone, products_in
+from race.config.hyper import Hyper, hyper_of
 from race.config.presets import resolve
 from race.config.settings import Algo, Config
 from race.config.shape import shape_of
-from race.replay.buffer import Replay
+from race.replay.buffer import Replay, slots_of
 from race.replay.packing import layouts
 from race.rollouts.episodes import empty_episode
 from race.runs import directory as run_directory
@@ -32,8 +33,10 @@ SHAPES: Final[dict[str, DiscreteSpec]] = {
     "MMM2": DiscreteSpec("MMM2", 10, 176, 322, 18, 100),
 }
 """Of two maps, with minibatches as long as battles of trained teams."""
-GOALS_MS: Final = {("race", "2s3z"): 100.0, ("race", "MMM2"): 350.0}
+GOALS_MS: Final = {("race", "2s3z"): 70.0, ("race", "MMM2"): 260.0}
 """Milliseconds per RACE step on two cores, with five teams in the population."""
+GOALS_OVER_FLOOR: Final = dict.fromkeys(GOALS_MS, 1.5)
+"""Over the time of the step's matrix products alone."""
 STEPS: Final = 6
 """Gradient steps of a call: those of a generation of RACE."""
 ROUNDS: Final = 6
@@ -49,8 +52,9 @@ def subjects() -> list[Subject]:
     algos: tuple[Algo, ...] = ("race", "facmac")
     for algo in algos:
         for shape in SHAPES:
-            name = f"update-episodes/{algo}/{shape}/ms"
-            found.append(Subject((name,), partial(_measure_update, name, algo, shape)))
+            name = f"update-episodes/{algo}/{shape}"
+            names = (f"{name}/ms", f"{name}/over_floor")
+            found.append(Subject(names, partial(_measure_update, name, algo, shape)))
     name = f"training/{TRAINED_MAP}/env_steps_per_second"
     return [*found, Subject((name,), partial(_measure_training, name))]
 
@@ -82,7 +86,8 @@ class EpisodeUpdates:
 
     def __init__(self, config: Config, spec: DiscreteSpec, episodes: Episode) -> None:
         algorithm = algorithm_of(config)
-        self._statics = {"algorithm": algorithm, "spec": spec, "shape": shape_of(config)}
+        self._algorithm, self._spec, self._shape = algorithm, spec, shape_of(config)
+        self._statics = {"algorithm": algorithm, "spec": spec, "shape": self._shape}
         self._hyper = hyper_of(config)
         places = np.tile(np.arange(config.facmac.batch_size), (STEPS, 1))
         self._layout = layouts(places, episodes.length[places], spec.episode_limit)
@@ -107,6 +112,17 @@ class EpisodeUpdates:
         )
         return self._state
 
+    def products(self) -> list[Product]:
+        """Those of one gradient step that copies no targets."""
+        slots = slots_of(self.replay, jax.tree.map(lambda column: column[0], self._layout))
+        of_all = self._spec, self._shape
+
+        def update(state: Any, slots: Any, key: jax.Array, hyper: Hyper) -> Any:
+            return self._algorithm.update(state, slots, jnp.int32(0), key, *of_all, hyper)
+
+        lowered = jax.jit(update).lower(self._state, slots, jax.random.key(3), self._hyper)
+        return products_in(str(lowered.compile().as_text()))
+
 
 def _measure_update(name: str, algo: Algo, shape: str) -> list[Measurement]:
     spec = SHAPES[shape]
@@ -117,10 +133,14 @@ def _measure_update(name: str, algo: Algo, shape: str) -> list[Measurement]:
     updates = EpisodeUpdates(config, spec, episodes)
     # A generation of the baseline is one episode, and so one step.
     steps = STEPS if config.has_population else 1
-    run: Callable[[], Any] = partial(updates, steps)
-    jax.block_until_ready(run())
-    (best,) = interleaved_best([run], ROUNDS)
-    return [Measurement(name, 1e3 * best / steps, "ms", GOALS_MS.get((algo, shape)))]
+    floor = products_alone(updates.products())
+    runs: list[Callable[[], Any]] = [partial(updates, steps), partial(floor, steps)]
+    best, alone = interleaved_best(runs, ROUNDS)
+    goal = GOALS_OVER_FLOOR.get((algo, shape))
+    return [
+        Measurement(f"{name}/ms", 1e3 * best / steps, "ms", GOALS_MS.get((algo, shape))),
+        Measurement(f"{name}/over_floor", best / alone, "", goal),
+    ]
 
 
 def _measure_training(name: str) -> list[Measurement]:

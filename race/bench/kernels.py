@@ -94,6 +94,47 @@ def kernels_in(hlo: str) -> Counter[str]:
     return count(entry)
 
 
+def executions(hlo: str) -> dict[str, int]:
+    """How often each computation is carried out when a compiled program runs once.
+
+    Fusions and calls count, loops as often as they turn; of a choice every branch counts.
+
+    Args:
+        hlo: as `kernels_in` takes it.
+
+    Returns:
+        By the computations' names; those that are never carried out, as the scalar functions of
+        reductions, have none.
+    """
+    entry, computations = _read(hlo)
+    found: Counter[str] = Counter()
+
+    def run(name: str, times: int) -> None:
+        found[name] += times
+        for instruction in computations[name]:
+            match instruction.opcode:
+                case "while":
+                    turns = _turns(instruction.text)
+                    run(instruction.names("body"), times * turns)
+                    run(instruction.names("condition"), times * (turns + 1))
+                case "conditional":
+                    for branch in _branches(instruction):
+                        run(branch, times)
+                case "call":
+                    run(instruction.names("to_apply"), times)
+                case "fusion":
+                    run(instruction.names("calls"), times)
+
+    run(entry, 1)
+    return dict(found)
+
+
+def name_of_computation(line: str) -> str | None:
+    """The name of the computation that a line of a compiled program begins."""
+    head = _HEAD.match(line)
+    return head[2] if head else None
+
+
 def _times(counts: Counter[str], factor: int) -> Counter[str]:
     return Counter({opcode: number * factor for opcode, number in counts.items()})
 

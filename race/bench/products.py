@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import groupby
 from typing import Any, NamedTuple
 
 import jax
@@ -15,11 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from race.bench.kernels import executions, name_of_computation
+
 _SHAPE = r"(\w+)\[([\d,]*)\]"
 _DEFINITION = re.compile(rf"^\s*(?:ROOT )?%?([\w.\-]+) = {_SHAPE}")
 _PARAMETER = re.compile(rf"%?([\w.\-]+): {_SHAPE}")
 _DOT = re.compile(r" dot\(([^()]*)\)(.*)$")
 _OPERAND = re.compile(r"%?([\w.\-]+)$")
+_LOOP = 8
 _DTYPES = {"f16": "float16", "bf16": "bfloat16", "f32": "float32", "f64": "float64"}
 
 
@@ -40,7 +44,7 @@ class Product(NamedTuple):
 
 
 def products_in(hlo: str) -> list[Product]:
-    """Every matrix product in the text of a compiled program, in all its computations.
+    """Every matrix product of a compiled program, as often as it is carried out.
 
     Args:
         hlo: what ``jax.jit(f).lower(...).compile().as_text()`` returns.
@@ -50,16 +54,18 @@ def products_in(hlo: str) -> list[Product]:
     """
     found: list[Product] = []
     shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
+    times, count = executions(hlo), 0
     for line in hlo.splitlines():
         if line.endswith("{") and not line.startswith(" "):
             # The head of a computation: names are its own from here on.
+            count = times.get(name_of_computation(line) or "", 0)
             shapes = {name: (dtype, _sizes(s)) for name, dtype, s in _PARAMETER.findall(line)}
             continue
         if definition := _DEFINITION.match(line):
             name, dtype, sizes = definition.groups()
             shapes[name] = (dtype, _sizes(sizes))
         if dot := _DOT.search(line):
-            found.append(_product(dot[1], dot[2], shapes))
+            found += count * [_product(dot[1], dot[2], shapes)]
     return found
 
 
@@ -135,17 +141,31 @@ def run_products(
 
     def body(_: Array, operands: Operands) -> Operands:
         left = dict(operands.left)
-        for product in products:
+        for product, equal in groupby(products):
             mine = _kind(product.left, product.dtype)
             right = operands.right[_kind(product.right, product.dtype)]
-            result = jax.lax.dot_general(left[mine], right, (product.contracting, product.batch))
-            result = jax.lax.optimization_barrier(result)
-            number = jnp.tanh(result[(0,) * result.ndim])
-            place = left[mine].at[(0,) * left[mine].ndim]
-            left[mine] = place.set(number, mode="promise_in_bounds")
+            once = partial(_once, product, right)
+            count = len(list(equal))  # of a loop's turns; as many copies would take long to compile
+            if count < _LOOP:
+                for _turn in range(count):
+                    left[mine] = once(left[mine])
+            else:
+                left[mine] = _repeated(once, count, left[mine])
         return Operands(left, operands.right)
 
     return jax.lax.fori_loop(0, repetitions, body, operands)
+
+
+def _repeated(once: Callable[[Array], Array], count: int, left: Array) -> Array:
+    repeated: Array = jax.lax.fori_loop(0, count, lambda _, x: once(x), left)
+    return repeated
+
+
+def _once(product: Product, right: Array, left: Array) -> Array:
+    result = jax.lax.dot_general(left, right, (product.contracting, product.batch))
+    result = jax.lax.optimization_barrier(result)
+    number = jnp.tanh(result[(0,) * result.ndim])
+    return left.at[(0,) * left.ndim].set(number, mode="promise_in_bounds")
 
 
 def products_alone(products: Sequence[Product]) -> Callable[[int], Any]:

@@ -37,6 +37,7 @@ ENTRY %main.5 (x.1: f32[4,3], y.1: f32[4,7]) -> f32[3,7] {
   %x.1 = f32[4,3]{1,0} parameter(0)
   %y.1 = f32[4,7]{1,0} parameter(1)
   %param_0.1 = f32[7,1]{1,0} constant({...})
+  %called = f32[2,4,5]{2,1,0} fusion(%a, %b), kind=kOutput, calls=%wrapped_dot
   %product = f32[3,7]{1,0} dot(f32[4,3]{1,0} %x.1, f32[4,7]{1,0} %y.1), \
 lhs_contracting_dims={0}, rhs_contracting_dims={0}
   ROOT dot.2 = f32[3,1]{1,0} dot(product, param_0.1), lhs_contracting_dims={1}, \
@@ -75,8 +76,18 @@ def test_products_of_a_compiled_program() -> None:
     ]
 
 
+def test_products_in_a_loop_count_as_often_as_it_turns() -> None:
+    def f(x: Any, w: Any) -> Any:
+        return jax.lax.scan(lambda y, v: (jnp.tanh(y @ v), None), x, w)[0]
+
+    text = jax.jit(f).lower(jnp.ones((8, 16)), jnp.ones((5, 16, 16))).compile().as_text()
+    assert text is not None
+    assert [p.operations for p in products_in(text)] == 5 * [2 * 8 * 16 * 16]
+
+
 def test_the_program_of_products_alone_computes_all_of_them() -> None:
     products = products_in(HLO)
+    products += 10 * [products[1]]  # enough for a loop
     # Twice the same product: neither may be merged with the other.
     products.append(products[0])
     compiled = run_products.lower(
