@@ -25,7 +25,6 @@ Statistic = Callable[[Strata], Floats]
 """Arrays ``[draws, seeds]`` for each stratum -> ``[draws]``."""
 
 UNBOUNDED = (-math.inf, math.inf)
-SHARE = (0.0, 1.0)
 
 
 def interquartile_mean(strata: Strata) -> Floats:
@@ -66,9 +65,9 @@ def bootstrap_interval(
 ) -> Estimate:
     """A number of all strata with an interval from the stratified bootstrap over seeds.
 
-    ``value +- t s``, where ``s^2 = sum v_m n_m / (n_m - 1)`` over strata, ``v_m`` is the variance of
-    the statistic while seeds of stratum m alone are drawn again, and t has the degrees of freedom
-    of Welch and Satterthwaite, ``s^4 / sum (v_m n_m / (n_m - 1))^2 / (n_m - 1)``.
+    ``value +- t s``, where ``s^2 = sum v_m n_m / (n_m - 1)`` over strata, ``v_m`` is the variance
+    of the statistic while seeds of stratum m alone are drawn again, and t has the degrees of
+    freedom of Welch and Satterthwaite, ``s^4 / sum (v_m n_m / (n_m - 1))^2 / (n_m - 1)``.
 
     Args:
         strata: see `Strata`.
@@ -115,11 +114,11 @@ def probability_of_improvement(
     2021). Its interval is Newcombe's (2006, method 5) score interval: all values p that are no
     further than ``t sqrt(V(p))`` from the estimate, with
 
-        ``V(p) = p (1 - p) / (n m) (1 + N (1 - p) / (2 - p) + N p / (1 + p))``, ``N = (n + m) / 2 - 1``
+        ``V(p) = p (1 - p) / (n m) (1 + N (1 - p) / (2 - p) + N p / (1 + p))``
 
-    on one task and the mean of V over tasks, divided by their number, on several: V is concave, so
-    that tasks with unlike p make the interval too wide, not too narrow. Newcombe's z is Student's
-    t with the seeds' degrees of freedom here, which is on the safe side.
+    and ``N = (n + m) / 2 - 1`` on one task; on several, the mean of V over tasks, divided by their
+    number: V is concave, so that tasks with unlike p make the interval too wide, not too narrow.
+    Newcombe's z is Student's t with the seeds' degrees of freedom here, on the safe side.
 
     Args:
         methods: one array ``[seeds]`` a task.
