@@ -52,7 +52,11 @@ def scales(
         return {task: given[task] for task in scores.tasks() if task in given}, said, missing
     found, without = {}, {}
     if how == "base" and base is None:
-        raise RaceError("There is one method alone, so nothing to be a base: --normalise range.")
+        left_out = f" Mind: {scores.differences[0]}" if scores.differences else ""
+        raise RaceError(
+            f"There is one method alone with scores, {scores.methods()[0]}, so nothing to be a "
+            f"base: --normalise range.{left_out}"
+        )
     for task in scores.tasks():
         runs = [run for run in scores.runs if run.task == task]
         finals = np.array([run.final for run in runs])

@@ -148,7 +148,9 @@ def _over_tasks(found: Comparison) -> Table:
     if against:
         columns += [f"P(beats {found.base})", f"gain over {found.base}"]
     tasks = f"{len(found.common)} task{'s' if len(found.common) != 1 else ''}"
-    return Table(f"Over {tasks}, final scores", columns, lines, _scope(found))
+    return Table(
+        f"Over {tasks if found.common else 'tasks'}, final scores", columns, lines, _scope(found)
+    )
 
 
 def _scope(found: Comparison) -> str:

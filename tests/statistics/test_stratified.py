@@ -164,5 +164,5 @@ def test_numbers_are_those_of_rliable() -> None:
     )
     library = pytest.importorskip("rliable.library")
     taus = np.linspace(-0.5, 1.5, 21)
-    profile = library.run_score_deviation(scores[0], taus)
+    profile = [library.run_score_deviation(scores[0], tau) for tau in taus]
     np.testing.assert_allclose([p.value for p in share_above(X, taus)], profile)
