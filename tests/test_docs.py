@@ -23,12 +23,16 @@ SMALL = {
     "render": "--seconds 0.3",
     "bench": "--only env/Hopper*",
     "plot": "",
+    "compare": "",
     "archive": "",
     "show": "",
     "sweep": "",
     "list": "",
     "doctor": "",
 }
+
+READERS = {"plot", "compare", "report"}
+"""Commands that read results."""
 
 CONTINUOUS = (
     "--learner.random-steps 600 --learner.hidden-sizes 10 8 "
@@ -72,7 +76,7 @@ def test_commands_in_documents_run(
         words = shlex.split(line)
         for word in words:
             # Figures of results show runs besides those whose commands are shown.
-            if word.startswith("results/") and (ROOT / word).exists() and "plot" in words:
+            if word.startswith("results/") and (ROOT / word).exists() and READERS & {*words}:
                 Path(word).parent.mkdir(parents=True, exist_ok=True)
                 shutil.copy(ROOT / word, word)
         main(small(words[words.index("race") + 1 :]))

@@ -22,6 +22,8 @@ COMMANDS = {
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",
     "plot": "draw learning curves of one or more runs",
+    "compare": "say which method is better, and how sure that is",
+    "report": "make a page about runs that needs no network",
     "show": "show what a run is, without running any code of it",
     "archive": "put the results of many runs into one small file",
     "list": "show tasks, algorithms, ablations and presets",

@@ -1,4 +1,5 @@
 """Statistics over seeds: the unit is the run, never the episode.
 
-An interval may be changed here, with its simulated coverage; figures and tables take it as it is.
+`intervals` of one mean, `stratified` numbers over several tasks, `separation` of two methods. An
+interval may be changed here, with its simulated coverage; figures and tables take it as it is.
 """

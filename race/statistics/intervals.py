@@ -28,6 +28,22 @@ class Interval(NamedTuple):
     high: NDArray[np.float64]
 
 
+class Estimate(NamedTuple):
+    """One number and the interval around it."""
+
+    value: float
+    low: float  # NaN where there are too few seeds for an interval, as `high`
+    high: float
+
+
+def mean_estimate(
+    seeds: ArrayLike, bounds: tuple[float, float] = (-math.inf, math.inf)
+) -> Estimate:
+    """`mean_interval` of one number: the mean over ``[seeds]`` with its 95% interval."""
+    found = mean_interval(seeds, bounds)
+    return Estimate(float(found.mean), float(found.low), float(found.high))
+
+
 def mean_interval(
     values: ArrayLike,
     bounds: tuple[float, float] = (-math.inf, math.inf),

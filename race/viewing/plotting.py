@@ -177,6 +177,12 @@ def _draw(
             axes.plot(run.x[-1], height, marker="x", color=colour, markersize=7)
 
 
+def colours_of(names: Sequence[str]) -> dict[str, str]:
+    """A colour for each method, whose name may tell settings after it (`curves.names_of`)."""
+    found = _colours({(name.partition(" ")[0], name): [] for name in names})
+    return {name: colour for (_, name), colour in found.items()}
+
+
 def _colours(methods: Methods) -> dict[tuple[str, str], str]:
     """A colour for each method, and for each of several experiments with one method."""
     known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
