@@ -1,9 +1,10 @@
 """Trained teams, read back from a run directory, ready to act."""
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, final
+from typing import Any, NamedTuple, final, get_args
 
 import jax
 import numpy as np
@@ -22,7 +23,7 @@ from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.training.run_state import Progress
-from race.training.saving import check_owner, learned_of, progress_of
+from race.training.saving import check_owner, looked_at, progress_of
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
 
 _choose = jax.jit(choose)
@@ -31,18 +32,24 @@ _choose = jax.jit(choose)
 class Trained(NamedTuple):
     """The teams of a run's newest checkpoint."""
 
+    path: Path
+    """The run's directory."""
     config: Config
     task: AnyTask
     progress: Progress
     encoders: dict[str, Any]  # by team, which may share them
     heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and "champion", as far as there are such
 
-    def resolve(self, team: TeamName) -> str:
+    def resolve(self, team: str) -> str:
         """``marl`` or ``champion``: what ``selected`` stands for by the training returns.
 
         Raises:
             ConfigError: if the run has no such team.
         """
+        if team not in get_args(TeamName):
+            raise ConfigError(
+                f"There is no team {team!r}: a run's teams are {', '.join(get_args(TeamName))}."
+            )
         name = self.progress.selected if team == "selected" else team
         if name not in self.heads:
             (only,) = self.heads
@@ -53,7 +60,7 @@ class Trained(NamedTuple):
             )
         return name
 
-    def policy(self, team: TeamName) -> Callable[[ArrayLike], NDArray[np.float32]]:
+    def policy(self, team: str) -> Callable[[ArrayLike], NDArray[np.float32]]:
         """The team as a function from a state [S] to a joint action [U] in [-1, 1].
 
         The function raises `HandedOverError` for what an environment of the task may not show:
@@ -78,7 +85,7 @@ class Trained(NamedTuple):
 
         return joint_action
 
-    def recurrent_policy(self, team: TeamName) -> "RecurrentPolicy":
+    def recurrent_policy(self, team: str) -> "RecurrentPolicy":
         """The team as it plays tasks with discrete actions.
 
         Raises:
@@ -136,13 +143,14 @@ def _told(task: str) -> Iterator[None]:
         ) from error
 
 
-def load_trained(path: Path) -> Trained:
+def load_trained(path: str | os.PathLike[str]) -> Trained:
     """The teams in the newest checkpoint of the run in ``path``.
 
     Raises:
         RunDirectoryError: if ``path`` holds no run, or one without a checkpoint.
         CheckpointError: if the checkpoint is damaged.
     """
+    path = Path(path)
     config = run_directory.open_run(path)
     newest = checkpoints.newest(RunDirectory(path).checkpoints)
     if newest is None:
@@ -154,8 +162,8 @@ def load_trained(path: Path) -> Trained:
     check_owner(saved, run_directory.identity_of(path))
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     refuse_changed(run_directory.recorded_task(path), task)
-    state = learned_of(saved, config, task.spec, algorithm)["algorithm"]
+    state = looked_at(saved, config, task.spec, algorithm)
     groups = algorithm.tested(state, task.spec)
     encoders = {name: group.encoder for group in groups for name in group.heads}
     heads = {name: head for group in groups for name, head in group.heads.items()}
-    return Trained(config, task, progress_of(saved), encoders, heads)
+    return Trained(path, config, task, progress_of(saved), encoders, heads)

@@ -20,7 +20,7 @@ from race.replay.buffer import Replay
 from race.runs import checkpoints
 from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
 from race.runs.metrics import Extent
-from race.runs.trees import flatten, restore
+from race.runs.trees import blank, flatten, restore
 from race.training.run import Run, stamped
 from race.training.run_state import Progress, RunState, statics
 from race.types import Spec
@@ -145,6 +145,25 @@ def learned_of(
     }
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
     return copy(restore(template, _as_now(saved.arrays, template)))
+
+
+def looked_at(saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm) -> Any:
+    """The algorithm's state that a checkpoint holds, to look at and not to go on with.
+
+    No program is compiled for it, so that a team is there at once.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+
+    def fresh() -> dict[str, Any]:
+        key = root_key(config.seed, Purpose.INIT)
+        state = start(key, hyper=hyper_of(config), **statics(config, spec, algorithm))
+        return {"algorithm": state, "losses": empty_losses(algorithm)}
+
+    template = blank(jax.eval_shape(fresh))
+    restored = restore(template, _as_now(saved.arrays, template))["algorithm"]
+    return jax.tree.map(lambda leaf: leaf if callable(leaf) else jnp.asarray(leaf), restored)
 
 
 # Arrays of a population, by the names they had before it was a part of its own.
