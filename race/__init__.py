@@ -1,6 +1,7 @@
 """RACE: multi-agent reinforcement learning coupled with an evolving population of teams.
 
-From Python: `race.train`, `race.load`, `race.evaluate`, `race.render` (`race.api`).
+From Python: `race.train`, `race.load`, `race.evaluate`, `race.render`, `race.export`
+(`race.api`).
 """
 
 import importlib
@@ -13,7 +14,7 @@ ALGORITHM_VERSION = 2
 
 # Their module imports JAX, which takes seconds: it is imported when one of them is asked for.
 # ``__init__.pyi`` tells type checkers.
-_OF_API = ("Rows", "Run", "Team", "evaluate", "load", "render", "train")
+_OF_API = ("Rows", "Run", "Team", "evaluate", "export", "load", "render", "train")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""What the shell does, from Python: train, load, evaluate, render.
+"""What the shell does, from Python: train, load, evaluate, render, export.
 
 Everything here is also an attribute of `race` itself: ``race.train(...)``, ``race.load(...)``.
 """
@@ -24,6 +24,9 @@ from race.runs import directory as run_directory
 from race.runs.directory import RunDirectory
 from race.teams.evaluation import Evaluation
 from race.teams.evaluation import evaluate as play
+from race.teams.export import Exported, format_of
+from race.teams.export import export as write
+from race.teams.formats import Format
 from race.teams.team import Team
 from race.teams.trained import Trained, load_trained
 from race.training.asking import settled_with_file, tried, usual_directory
@@ -283,6 +286,33 @@ def render(
     frames = filming.write(drawn, path)
     steps, episode_return, _ = drawn.summary()
     return Video(path, frames, steps, episode_return)
+
+
+def export(
+    what: Run | Team | Directory,
+    out: Directory = "team.onnx",
+    team: str = "selected",
+    *,
+    format: Format | None = None,
+    per_agent: bool = False,
+) -> list[Exported]:
+    """Writes a team to a file that runs without JAX and without race, as `race export` does.
+
+    Args:
+        what: a run, its directory, or a team.
+        out: the file.
+        team: of a run, which.
+        format: ``onnx``, ``stablehlo`` or ``numpy``. None: what ``out`` ends with.
+        per_agent: one file for each agent.
+
+    Raises:
+        RaceError: if it cannot be written, or would act as another team.
+    """
+    path = Path(out)
+    kind = format_of(path, format)
+    use_cache()
+    trained, name = _which(what, team)
+    return write(Team(trained, trained.resolve(name)), path, kind, per_agent=per_agent)
 
 
 def _which(what: Run | Team | Directory, team: str) -> tuple[Trained, str]:

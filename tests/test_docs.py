@@ -24,6 +24,7 @@ SMALL = {
     "evaluate": "--episodes 1",
     "render": "--seconds 0.3",
     "bench": "--only env/Hopper*",
+    "export": "",
     "plot": "",
     "archive": "",
     "show": "",

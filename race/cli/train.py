@@ -76,7 +76,7 @@ class Train:
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments, makes the run directory and trains."""
-    chosen, file = _parse(arguments)
+    chosen, file = _parse(arguments), _file_of(arguments)
     asked = Config(
         **{
             f.name: getattr(chosen, f.name)
@@ -149,13 +149,13 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
         run_directory.create(place, one, described)
 
 
-def _parse(arguments: list[str]) -> tuple[Train, Wanted]:
+def _parse(arguments: list[str]) -> Train:
     # Twice, because the preset is itself an argument: what it sets is a default, not a command.
     file = _file_of(arguments)
     first = tyro.cli(Train, args=arguments, prog="race train", default=_default(file))
     file = file._replace(preset=first.preset)
     named = file._replace(settings={**file.settings, "task": first.task})
-    return tyro.cli(Train, args=arguments, prog="race train", default=_default(named)), file
+    return tyro.cli(Train, args=arguments, prog="race train", default=_default(named))
 
 
 def _file_of(arguments: list[str]) -> Wanted:

@@ -34,6 +34,8 @@ class Trained(NamedTuple):
 
     path: Path
     """The run's directory."""
+    identity: str | None
+    """Of the run."""
     config: Config
     task: AnyTask
     progress: Progress
@@ -159,11 +161,12 @@ def load_trained(path: str | os.PathLike[str]) -> Trained:
             + command("race", "resume", path)
         )
     saved = checkpoints.load(newest, tables=False)
-    check_owner(saved, run_directory.identity_of(path))
+    identity = run_directory.identity_of(path)
+    check_owner(saved, identity)
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     refuse_changed(run_directory.recorded_task(path), task)
     state = looked_at(saved, config, task.spec, algorithm)
     groups = algorithm.tested(state, task.spec)
     encoders = {name: group.encoder for group in groups for name in group.heads}
     heads = {name: head for group in groups for name, head in group.heads.items()}
-    return Trained(path, config, task, progress_of(saved), encoders, heads)
+    return Trained(path, identity, config, task, progress_of(saved), encoders, heads)

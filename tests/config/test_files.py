@@ -111,13 +111,12 @@ def file(tmp_path: Path) -> Path:
 
 
 def test_options_come_on_top_of_a_file(file: Path) -> None:
-    chosen, wanted = _parse(["--config", str(file), "--learner.batch-size", "8"])
+    chosen = _parse(["--config", str(file), "--learner.batch-size", "8"])
     assert isinstance(chosen, Train)
     assert (chosen.task, chosen.seed, chosen.preset) == ("probe/target", 5, "demo")
     assert chosen.learner == dataclasses.replace(PRESETS["demo"], batch_size=8)
     assert chosen.race == RaceConfig(population_size=6)
-    assert wanted.settings["learner.batch_size"] == 16
-    other = _parse(["probe/chain", f"--config={file}", "--preset", "td3", "--seed", "2"])[0]
+    other = _parse(["probe/chain", f"--config={file}", "--preset", "td3", "--seed", "2"])
     assert (other.task, other.seed) == ("probe/chain", 2)
     assert other.learner == dataclasses.replace(PRESETS["td3"], batch_size=16)
 

@@ -66,4 +66,5 @@ def trained_of(encoder: Any, heads: Any, spec: Any, make: Any = None) -> Trained
     discrete = isinstance(spec, DiscreteSpec)
     task: AnyTask = DiscreteTask(spec, make) if discrete else Task(spec, make)
     config = resolve(Config("tiny", algo="facmac"), discrete=discrete)
-    return Trained(Path("tiny"), config, task, Progress(), {"marl": encoder}, {"marl": heads})
+    teams = ({"marl": encoder}, {"marl": heads})
+    return Trained(Path("tiny"), None, config, task, Progress(), *teams)
