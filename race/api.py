@@ -27,8 +27,9 @@ from race.teams.evaluation import evaluate as play
 from race.teams.export import Exported, format_of
 from race.teams.export import export as write
 from race.teams.formats import Format
+from race.teams.heirloom import heirloom_of
 from race.teams.team import Team
-from race.teams.trained import Trained, load_trained
+from race.teams.trained import Trained, load_trained, names_of_checkpoints
 from race.training.asking import settled_with_file, tried, usual_directory
 from race.training.interrupts import Interrupts
 from race.training.run_state import Progress
@@ -88,9 +89,8 @@ class Run:
 
     @property
     def checkpoints(self) -> list[str]:
-        """The names of its checkpoints, oldest first."""
-        folder = RunDirectory(self.path).checkpoints
-        return [path.name for path in checkpoints.list_checkpoints(folder)]
+        """The names of its checkpoints, oldest first, then of its best teams, best first."""
+        return names_of_checkpoints(self.path)
 
     def rows(self, kind: str | None = None) -> Rows:
         """Its rows of metrics, oldest first, as dictionaries; none if it is young.
@@ -106,28 +106,25 @@ class Run:
         found = metrics.read(run.metrics, identity, kept) if run.metrics.exists() else []
         return Rows(row for row in found if kind in (None, row.get("kind")))
 
-    def trained(self) -> Trained:
-        """All teams of its newest checkpoint.
+    def trained(self, checkpoint: str | None = None) -> Trained:
+        """All teams of a checkpoint, as of `team`."""
+        return load_trained(self.path, checkpoint)
 
-        Raises:
-            RunDirectoryError: if there is none yet.
-            CheckpointError: if it is damaged.
-        """
-        return load_trained(self.path)
-
-    def team(self, name: str = "selected") -> Team:
-        """A team of its newest checkpoint, ready to act.
+    def team(self, name: str = "selected", checkpoint: str | None = None) -> Team:
+        """A team, ready to act.
 
         Args:
             name: ``marl``, the gradient learner's; ``champion``, the population's of best training
                 fitness; ``selected``, of these two the one with the better training return.
+            checkpoint: one of `checkpoints`, or ``best``, the best tested team that was kept.
+                None: the newest checkpoint.
 
         Raises:
             ConfigError: if the run has no such team.
-            RunDirectoryError: if there is no checkpoint yet.
+            RunDirectoryError: if there is no such checkpoint.
             CheckpointError: if it is damaged.
         """
-        trained = self.trained()
+        trained = self.trained(checkpoint)
         return Team(trained, trained.resolve(name))
 
     def resume(
@@ -183,8 +180,9 @@ def train(
             and left, to be gone on with by `Run.resume`; an error that it raises is raised here
             once the run is saved.
         progress: whether to print a line per test, and a bar on a terminal.
-        settings: ``algo``, ``base``, ``seed``, ``env_steps``, ``preset``, ``ablation``,
-            ``learner``, ``facmac``, ``race``, ``env``, ``evaluation``, ``checkpoint``.
+        settings: ``algo``, ``base``, ``seed``, ``env_steps``, ``init_from``, ``preset``,
+            ``ablation``, ``learner``, ``facmac``, ``race``, ``env``, ``evaluation``,
+            ``checkpoint``.
 
     Raises:
         RaceError: with a message that says what to do; see `race.errors`.
@@ -213,7 +211,9 @@ def train(
     )
     path = usual_directory(resolved) if run_dir is None else Path(run_dir)
     run_directory.refuse_occupied(path)
+    begins_with = heirloom_of(resolved, made)
     run_directory.create(path, resolved, describe(made) | tried(resolved.task, made))
+    begins_with.hand_to(path)
     _train(path, resolved, on_row, progress)
     return Run(path)
 

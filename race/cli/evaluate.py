@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from race.cli import streams
+from race.cli.naming import CHECKPOINT
 from race.config.settings import TeamName
 
 
@@ -21,6 +22,9 @@ class Evaluate:
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The run's directory."""
+    checkpoint: Annotated[str | None, CHECKPOINT] = None
+    """One of the run's checkpoints, or of the best teams that it kept (`race show DIR` names them);
+    best: the best tested of these."""
     team: TeamName = "selected"
     """The gradient learner's team, the population's team of best training fitness, or of these
     two the one with the better training return."""
@@ -44,7 +48,7 @@ def main(arguments: list[str]) -> None:
 
     check_asked(chosen.episodes, chosen.seed)
     use_cache()
-    trained = load_trained(chosen.run_dir)
+    trained = load_trained(chosen.run_dir, chosen.checkpoint)
     with Progress(console=streams.console(stderr=True), transient=True) as bar:
         playing = bar.add_task("playing", total=chosen.episodes)
         found = evaluate(

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import tyro
 
 from race.cli import streams
+from race.cli.naming import CHECKPOINT
 from race.config.settings import TeamName
 
 
@@ -22,6 +23,9 @@ class Export:
 
     run_dir: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """The run's directory."""
+    checkpoint: Annotated[str | None, CHECKPOINT] = None
+    """One of the run's checkpoints, or of the best teams that it kept (`race show DIR` names them);
+    best: the best tested of these."""
     team: TeamName = "selected"
     """The gradient learner's team, the population's team of best training fitness, or of these
     two the one with the better training return."""
@@ -56,7 +60,7 @@ def main(arguments: list[str]) -> None:
     use_cache()
     console = streams.console(stderr=True)
     with console.status("loading the team"):
-        team = chosen_team(load_trained(chosen.run_dir), chosen.team)
+        team = chosen_team(load_trained(chosen.run_dir, chosen.checkpoint), chosen.team)
     with console.status("writing and checking"):
         files = export(team, out, kind, per_agent=chosen.per_agent)
     label = {"marl": "MARL team", "champion": "champion"}[team.name]

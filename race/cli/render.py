@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from race.cli import streams
+from race.cli.naming import CHECKPOINT
 from race.config.settings import TeamName
 from race.errors import ConfigError
 from race.viewing.wanted import check_seed, check_video
@@ -39,6 +40,9 @@ class Render:
     ] = None
     """For a run: the gradient learner's team, the population's team of best training fitness, or
     of these two the one with the better training return."""
+    checkpoint: Annotated[str | None, CHECKPOINT] = None
+    """For a run: one of its checkpoints, or of the best teams that it kept (`race show DIR` names
+    them); best: the best tested of these."""
     policy: Annotated[
         PolicyName | None,
         tyro.conf.arg(metavar="{scripted,random}", help_behavior_hint="(default: scripted)"),
@@ -69,9 +73,10 @@ def main(arguments: list[str]) -> None:
 
 
 def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
-    if chosen.team is not None:
+    if chosen.team is not None or chosen.checkpoint is not None:
+        given = "--checkpoint" if chosen.team is None else "--team"
         raise ConfigError(
-            f"--team is for runs, and {chosen.what} is a battle that no team was trained for: "
+            f"{given} is for runs, and {chosen.what} is a battle that no team was trained for: "
             "leave it out, or choose --policy scripted, random, nearest or heuristic."
         )
     if chosen.seed >= 2**32:
@@ -117,7 +122,7 @@ def _render_run(chosen: Render, out: Path) -> None:
     use_cache()
     team = chosen.team or "selected"
     with console.status("loading the team"):
-        trained = load_trained(chosen.what)
+        trained = load_trained(chosen.what, chosen.checkpoint)
     with console.status("playing the episode"):
         drawn = film(trained, team, chosen.seed, chosen.seconds, out, renderer)
     labels = {"marl": "MARL team", "champion": "champion"}

@@ -59,6 +59,9 @@ class Train:
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
     """Settings from a .toml by their names, or from the config.json of a run. Options beside it
     come on top; TASK may be left out if the file names it."""
+    init_from: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
+    """Begin with the teams of another run in place of random ones: its MARL team as the MARL team,
+    its champion as the first team of the population. Networks must have the same sizes."""
     run_dir: Path | None = None
     """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO; names of
     ablations follow ALGO."""
@@ -92,6 +95,7 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.teams.heirloom import heirloom_of
     from race.training.asking import name_of, settled_with_file, usual_directory
 
     if chosen.seeds is not None:  # this process only watches
@@ -104,7 +108,9 @@ def main(arguments: list[str]) -> None:
         refuse_for_one_run(chosen.jobs, chosen.cohort, "without --seeds. Leave it out.")
         path = chosen.run_dir or usual_directory(config)
         run_directory.refuse_occupied(path)
+        begins_with = heirloom_of(config, task)
         run_directory.create(path, config, describe(task) | tried(asked.task, task))
+        begins_with.hand_to(path)
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
@@ -130,6 +136,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     from race.config.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.teams.heirloom import heirloom_of
 
     seeds = parse_seeds(str(chosen.seeds))
     if chosen.seed != file.settings.get("seed", 1):
@@ -144,9 +151,11 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
                 f"`{command('race', 'resume', path)}`, or choose another directory with "
                 "`--run-dir`."
             )
+    begins_with = heirloom_of(config, task)
     described = describe(task) | tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
+        begins_with.hand_to(place)
 
 
 def _parse(arguments: list[str]) -> Train:

@@ -22,6 +22,7 @@ from race.config.settings import Config, LearnerConfig, Preset, fits, from_json,
 from race.errors import ConfigError
 
 _ALONE = ("preset", "ablation")
+_OF_ONE = ("seed", "init_from")  # a sweep has no such
 
 
 class Wanted(NamedTuple):
@@ -93,10 +94,10 @@ def of_mapping(description: Mapping[str, Any]) -> Wanted:
     for name in ("seeds", "sweep"):
         if name in description:
             raise ConfigError(f"{name} is for several runs, which `race sweep` trains.")
-    refuse_unknown("", dict(description), (*TOP, "seed", *_ALONE, *GROUPS))
+    refuse_unknown("", dict(description), (*TOP, *_OF_ONE, *_ALONE, *GROUPS))
     hints = get_type_hints(Config)
     settings: dict[str, Any] = {}
-    for name in (*TOP, "seed"):
+    for name in (*TOP, *_OF_ONE):
         if name in description:
             settings[name] = _value(name, description[name], hints[name])
     for group in GROUPS:
@@ -142,6 +143,7 @@ def of_record(config: Config) -> Wanted:
     preset, settings = min(zip(presets, found, strict=True), key=lambda pair: len(pair[1]))
     kept = {"task": config.task, "algo": config.algo, "seed": config.seed}
     kept |= {"env_steps": config.env_steps}
+    kept |= {} if config.init_from is None else {"init_from": config.init_from}
     return Wanted({**kept, **settings}, preset, config.ablation)
 
 

@@ -138,11 +138,7 @@ def learned_of(
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.
     """
-    key = root_key(config.seed, Purpose.INIT)
-    template = {
-        "algorithm": start(key, hyper=hyper_of(config), **statics(config, spec, algorithm)),
-        "losses": empty_losses(algorithm),
-    }
+    template = _fresh(config, spec, algorithm)
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
     return copy(restore(template, _as_now(saved.arrays, template)))
 
@@ -155,15 +151,36 @@ def looked_at(saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorith
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.
     """
+    template = blank(jax.eval_shape(lambda: _fresh(config, spec, algorithm)))
+    return _on_device(restore(template, _as_now(saved.arrays, template))["algorithm"])
 
-    def fresh() -> dict[str, Any]:
-        key = root_key(config.seed, Purpose.INIT)
-        state = start(key, hyper=hyper_of(config), **statics(config, spec, algorithm))
-        return {"algorithm": state, "losses": empty_losses(algorithm)}
 
-    template = blank(jax.eval_shape(fresh))
-    restored = restore(template, _as_now(saved.arrays, template))["algorithm"]
-    return jax.tree.map(lambda leaf: leaf if callable(leaf) else jnp.asarray(leaf), restored)
+def one_of(
+    saved: Checkpoint, name: str, config: Config, spec: Spec, algorithm: Algorithm
+) -> tuple[Any, Any]:
+    """Encoders and heads of the one team that a kept file holds.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+
+    def tested() -> dict[str, Any]:
+        groups = algorithm.tested(_fresh(config, spec, algorithm)["algorithm"], spec)
+        (found,) = ((group.encoder, group.heads[name]) for group in groups if name in group.heads)
+        return {"encoder": found[0], "head": found[1]}
+
+    restored = _on_device(restore(blank(jax.eval_shape(tested)), saved.arrays))
+    return restored["encoder"], restored["head"]
+
+
+def _fresh(config: Config, spec: Spec, algorithm: Algorithm) -> dict[str, Any]:
+    key = root_key(config.seed, Purpose.INIT)
+    state = start(key, hyper=hyper_of(config), **statics(config, spec, algorithm))
+    return {"algorithm": state, "losses": empty_losses(algorithm)}
+
+
+def _on_device(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf if callable(leaf) else jnp.asarray(leaf), tree)
 
 
 # Arrays of a population, by the names they had before it was a part of its own.
