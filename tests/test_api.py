@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,7 +14,8 @@ import pytest
 from whole_runs import rows as rows_of
 
 import race
-from race.errors import ConfigError, RaceError, RunDirectoryError
+from race.errors import CheckpointError, ConfigError, RaceError, RunDirectoryError
+from race.runs import team_files
 from race.teams.trained import load_trained
 
 LEARNER = {
@@ -26,7 +28,8 @@ SETTINGS: dict[str, Any] = {
     "algo": "matd3",
     "env_steps": 120,
     "learner": LEARNER,
-    "evaluation": {"every": 50, "episodes": 2},
+    "evaluation": {"every": 30, "episodes": 2},
+    "checkpoint": {"keep_best": 2},
     "progress": False,
 }
 
@@ -60,9 +63,9 @@ def test_a_run_is_what_the_shell_makes(run: race.Run) -> None:
     assert run.config.learner.hidden_sizes == (6, 5)
     found = run.rows()
     assert [row for row in found if row["kind"] == "evaluation"] == run.rows("evaluation")
-    assert len(run.rows("evaluation")) == 3
+    assert len(run.rows("evaluation")) == 4
     assert race.load(str(run.path)).rows() == found
-    assert run.checkpoints[-1] == "step-000000000120"
+    assert run.checkpoints[1] == "step-000000000120"
     assert "MATD3 on probe/target" in repr(run)
 
 
@@ -100,6 +103,76 @@ def test_an_error_of_a_callback_is_raised_once_the_run_is_saved(tmp_path: Path) 
     with pytest.raises(LookupError, match="mine"):
         race.train("probe/target", run_dir=tmp_path / "run", on_row=on_row, **SETTINGS)
     assert race.load(tmp_path / "run").checkpoints[-1] == "step-000000000041"
+
+
+def test_the_best_tested_teams_are_kept(run: race.Run) -> None:
+    tests = run.rows("evaluation")
+    by_return = sorted(tests, key=lambda row: -row["eval/marl/return_mean"])
+    expected = [f"step-{row['env_steps']:012d}-marl" for row in by_return[:2]]
+    assert run.checkpoints[2:] == expected
+    folder = run.path / "best"
+    assert sorted(path.stem for path in folder.iterdir()) == sorted(expected)
+    best = run.trained("best")
+    assert best.progress.env_steps == by_return[0]["env_steps"]
+    assert run.team(checkpoint=expected[1]).trained.progress.env_steps == by_return[1]["env_steps"]
+    # Those who were kept play as they did when they were tested; others play differently.
+    state = np.linspace(-1, 1, 4, dtype=np.float32)
+    actions = [run.team(checkpoint=name).act(state=state) for name in (*expected, None)]
+    assert len({tuple(action.tolist()) for action in actions}) == 3
+    with pytest.raises(ConfigError, match="is the marl team alone"):
+        run.team("champion", checkpoint="best")
+    with pytest.raises(RunDirectoryError, match=f"no checkpoint 'x'.*{expected[0]}"):
+        run.team(checkpoint="x")
+
+
+def test_a_kept_team_is_the_one_that_was_tested(run: race.Run, tmp_path: Path) -> None:
+    """At the end of a run nothing is learned between its test and its last checkpoint."""
+    settings = SETTINGS | {"checkpoint": {"keep_best": 9}}
+    with_all = race.train("probe/target", run_dir=tmp_path / "run", **settings)
+    state = np.linspace(-1, 1, 4, dtype=np.float32)
+    kept = with_all.team(checkpoint="step-000000000120-marl")
+    np.testing.assert_array_equal(kept.act(state=state), with_all.team().act(state=state))
+    np.testing.assert_array_equal(kept.act(state=state), run.team().act(state=state))
+    assert len(with_all.checkpoints) == 2 + 4
+
+
+def test_damaged_files_of_teams_are_refused(run: race.Run, tmp_path: Path) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(run.path, copied)
+    name = run.checkpoints[2]
+    file = copied / "best" / f"{name}.safetensors"
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    with pytest.raises(CheckpointError, match="digest"):
+        race.load(copied).team(checkpoint=name)
+    file.write_bytes(whole[:40])  # it is none any more
+    assert name not in race.load(copied).checkpoints
+    other = shutil.copytree(run.path, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    assert config["run"] == run.trained().identity
+    file.write_bytes(whole.replace(config["run"].encode(), b"0" * 16))
+    assert name not in race.load(copied).checkpoints  # its seal is broken
+
+
+def test_a_run_begins_with_the_team_of_another(run: race.Run, tmp_path: Path) -> None:
+    """With a step size of almost 0 it stays what it was handed."""
+    learner = {**LEARNER, "actor_learning_rate": 1e-12}
+    settings = {**SETTINGS, "learner": learner, "env_steps": 44, "init_from": str(run.path)}
+    second = race.train("probe/target", run_dir=tmp_path / "run", **settings, seed=7)
+    state = np.linspace(-1, 1, 4, dtype=np.float32)
+    np.testing.assert_allclose(
+        second.team().act(state=state), run.team().act(state=state), atol=1e-6
+    )
+    fresh = race.train(
+        "probe/target", run_dir=tmp_path / "fresh", **{**settings, "init_from": None}, seed=7
+    )
+    assert abs(fresh.team().act(state=state) - run.team().act(state=state)).max() > 0.01
+    info = team_files.info_of(second.path / "init.safetensors")
+    assert (info["from_run"], info["from_env_steps"]) == (run.trained().identity, 120)
+    wide = {**settings, "learner": {**learner, "hidden_sizes": (7, 5)}}
+    with pytest.raises(ConfigError, match=r"encoder.hidden.bias is \[2, 6\] there and \[2, 7\]"):
+        race.train("probe/target", run_dir=tmp_path / "wide", **wide)
+    assert not (tmp_path / "wide").exists()
 
 
 def test_a_team_is_loaded_from_text_or_path(run: race.Run) -> None:
