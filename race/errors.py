@@ -53,6 +53,10 @@ class DivergenceError(RaceError):
     """A loss or a fitness is no longer a finite number."""
 
 
+class ExportError(RaceError):
+    """A file of a team that cannot be written, or would act as another team."""
+
+
 class RenderError(RaceError):
     """A video that cannot be made on this machine."""
 

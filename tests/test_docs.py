@@ -1,10 +1,12 @@
 """Every command that the README and the documents show runs, in their order, at a small size."""
 
 import importlib
+import json
 import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -22,6 +24,7 @@ SMALL = {
     "evaluate": "--episodes 1",
     "render": "--seconds 0.3",
     "bench": "--only env/Hopper*",
+    "export": "",
     "plot": "",
     "compare": "",
     "archive": "",
@@ -45,7 +48,9 @@ def small(words: list[str]) -> list[str]:
     options = shlex.split(SMALL[words[0]])
     if "--seeds" in words:
         options += ["--seeds", "1-2"]
-    if words[0] == "train" and not isinstance(make_task(words[1]), DiscreteTask):
+    if words[0] == "train" and (
+        words[1] == "--config" or not isinstance(make_task(words[1]), DiscreteTask)
+    ):
         options += shlex.split(CONTINUOUS)
     return [*words, *options]
 
@@ -71,7 +76,8 @@ def test_commands_in_documents_run(
             main([*small(first), "--env-steps", "7000"])
     for block in re.findall(r"```toml\n(task = .*?)```", document.read_text(), re.DOTALL):
         one = block.replace('["race", "matd3"]', '"matd3"').replace('"1-3"', '"1"')
-        Path("sweep.toml").write_text(one.replace("[1e-3, 3e-4]", "1e-3"))
+        for name in ("sweep.toml", "settings.toml"):
+            Path(name).write_text(one.replace("[1e-3, 3e-4]", "1e-3"))
     for line in shown(document):
         words = shlex.split(line)
         for word in words:
@@ -81,7 +87,7 @@ def test_commands_in_documents_run(
                 shutil.copy(ROOT / word, word)
         main(small(words[words.index("race") + 1 :]))
     for example in re.findall(r"```python\n(.*?)```", document.read_text(), re.DOTALL):
-        if "load_trained" in example:  # it reads a run of these commands
+        if 'race.load("runs/battle' in example:  # it reads a run of these commands
             exec(example, {})
 
 
@@ -117,6 +123,41 @@ def test_examples_of_battles_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     (table,) = re.findall(r"```toml\n(.*?)```", text, re.DOTALL)
     Path("3m.toml").write_text(table)
     assert (make("3m.toml").shape.n_allies, make("3m.toml").shape.n_enemies) == (3, 3)
+
+
+def test_python_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page from its beginning to its end, with a smaller run."""
+    monkeypatch.chdir(tmp_path)
+    text = (ROOT / "docs/python.md").read_text()
+    learner = '{"hidden_sizes": (6, 5), "random_steps": 60, "gradient_steps_per_env_step": 0.05}'
+    for long, short in (
+        ("mamujoco/HalfCheetah-2x3", "mamujoco/Hopper-3x1"),
+        ("50_000", '70, algo="matd3", evaluation={"episodes": 1}'),
+        ('{"batch_size": 256}', learner),
+        ("seconds=5", "seconds=0.1"),
+        ("episodes=10", "episodes=2"),
+    ):
+        assert long in text
+        text = text.replace(long, short)
+    names: dict[str, Any] = {}
+    for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        exec(example, names)
+    assert names["stopped"].finished
+    assert abs(names["same"] - names["team"].act(state=names["state"])).max() < 1e-5
+    assert names["video"].frames > 1
+
+
+@pytest.mark.slow
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "docs/first-run.ipynb").read_text())
+    assert notebook["nbformat"] == 4
+    names: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert names["run"].finished
+    assert len(names["tests"]) > 4
 
 
 def test_the_readme_names_every_command() -> None:

@@ -29,6 +29,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
             {"viewing"},
             {"doctor"},
             {"bench"},
+            {"api"},
             {"cli"},
             {"__main__"},
         ),

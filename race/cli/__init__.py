@@ -21,6 +21,7 @@ COMMANDS = {
     "resume": "go on with a run exactly where it was",
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",
+    "export": "write a trained team to a file that runs elsewhere (ONNX, StableHLO, numpy)",
     "plot": "draw learning curves of one or more runs",
     "compare": "say which method is better, and how sure that is",
     "report": "make a page about runs that needs no network",

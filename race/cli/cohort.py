@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any, cast, get_args
 
-from race.cli.progress import test_summary
 from race.cli.worker import INTERRUPTED
 from race.compilation import use_cache
 from race.config.cohort import Batching
@@ -17,6 +16,7 @@ from race.runs import directory as run_directory
 from race.training.run import Report
 from race.training.run_state import Progress
 from race.training.trainer import Order, is_over, train_cohort
+from race.viewing.progress import test_summary
 
 
 def main(arguments: list[str]) -> int:

@@ -19,7 +19,6 @@ from rich.live import Live
 from rich.table import Table
 
 from race.cli import streams
-from race.cli.progress import duration, test_summary
 from race.cli.worker import INTERRUPTED, Watched, Worker
 from race.config.cohort import Batching, CohortConfig
 from race.config.presets import resolve
@@ -27,6 +26,7 @@ from race.errors import ConfigError, RunDirectoryError, command
 from race.runs import directory as run_directory
 from race.training.cohort import kind_of
 from race.training.interrupts import Handlers, give_back, listen
+from race.viewing.progress import duration, test_summary
 
 LOOK_EVERY = 0.5
 """Seconds between two looks at the runs."""

@@ -35,9 +35,9 @@ class Plot:
 def main(arguments: list[str]) -> None:
     """Parses the arguments, draws, and prints the curves' last points."""
     chosen = tyro.cli(Plot, args=arguments, prog="race plot")
-    from race.cli.progress import duration, rounded
     from race.errors import RunDirectoryError
     from race.viewing.plotting import plot
+    from race.viewing.progress import duration, rounded
 
     if not chosen.runs:
         raise RunDirectoryError("Say which runs to draw: race plot DIR [DIR ...] --out curves.png")

@@ -1,22 +1,19 @@
 """``race render``."""
 
 import math
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import tyro
 
 from race.cli import streams
+from race.cli.naming import CHECKPOINT
 from race.config.settings import TeamName
-from race.errors import ConfigError, RenderError
+from race.errors import ConfigError
+from race.viewing.wanted import check_seed, check_video
 
 PolicyName = Literal["scripted", "random", "nearest", "heuristic"]
-_SECONDS = 15.0
-MOST_SECONDS = 100_000
-STEPS_PER_SECOND = 2
-"""Of a battle, at the game's "normal" speed."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +40,9 @@ class Render:
     ] = None
     """For a run: the gradient learner's team, the population's team of best training fitness, or
     of these two the one with the better training return."""
+    checkpoint: Annotated[str | None, CHECKPOINT] = None
+    """For a run: one of its checkpoints, or of the best teams that it kept (`race show DIR` names
+    them); best: the best tested of these."""
     policy: Annotated[
         PolicyName | None,
         tyro.conf.arg(metavar="{scripted,random}", help_behavior_hint="(default: scripted)"),
@@ -65,23 +65,18 @@ def main(arguments: list[str]) -> None:
     # A directory of that name is a run.
     battle = chosen.what.startswith("micro/") and not Path(chosen.what).is_dir()
     out = chosen.out or Path("battle.gif" if battle else "team.mp4")
-    if out.suffix.lower() not in (".mp4", ".gif"):
-        raise RenderError(f"{out} is no video: the name must end with .mp4 or .gif.")
-    asked = chosen.seconds
-    if chosen.seed < 0 or (asked is not None and not 0 <= asked <= MOST_SECONDS):
-        raise ConfigError(
-            f"--seed and --seconds must be 0 or more, and --seconds at most {MOST_SECONDS}."
-        )
+    check_video(out, chosen.seconds, chosen.seed)
     if battle:
-        _render_battle(chosen, out, asked or 0.0)
+        _render_battle(chosen, out, chosen.seconds or 0.0)
     else:
         _render_run(chosen, out)
 
 
 def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
-    if chosen.team is not None:
+    if chosen.team is not None or chosen.checkpoint is not None:
+        given = "--checkpoint" if chosen.team is None else "--team"
         raise ConfigError(
-            f"--team is for runs, and {chosen.what} is a battle that no team was trained for: "
+            f"{given} is for runs, and {chosen.what} is a battle that no team was trained for: "
             "leave it out, or choose --policy scripted, random, nearest or heuristic."
         )
     if chosen.seed >= 2**32:
@@ -90,6 +85,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     from race.envs.micro import make
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
+    from race.viewing.filming import STEPS_PER_SECOND, of_battle
 
     use_cache()
     console, policy = streams.console(stderr=True), chosen.policy or "scripted"
@@ -97,12 +93,11 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
         recording = play(played, POLICIES[policy], chosen.seed, most_steps)
-    _write(_recorded(played, recording, out), f"{policy} policy", out, console)
+    _write(of_battle(played, recording, out), f"{policy} policy", out, console)
 
 
 def _render_run(chosen: Render, out: Path) -> None:
-    if chosen.seed >= 2**31:
-        raise ConfigError(f"The --seed of an episode must be below {2**31}.")
+    check_seed(chosen.seed)
     if chosen.policy is not None:
         raise ConfigError(
             f"--policy is for battles such as micro/2s3z, and {chosen.what} is the directory of a "
@@ -122,100 +117,27 @@ def _render_run(chosen: Render, out: Path) -> None:
             renderer = choose_renderer()
         console.print(f"Drawing with: {renderer.reason}", soft_wrap=True)
     from race.teams.trained import load_trained
+    from race.viewing.filming import film
 
     use_cache(config.compute)
+    team = chosen.team or "selected"
     with console.status("loading the team"):
-        trained = load_trained(Path(chosen.what))
-    if renderer is None:
-        drawn = _draw_discrete(chosen, trained, chosen.seconds or 0.0, out, console)
-    else:
-        seconds = _SECONDS if chosen.seconds is None else chosen.seconds
-        drawn = _continuous(chosen, trained, seconds, renderer)
+        trained = load_trained(chosen.what, chosen.checkpoint)
+    with console.status("playing the episode"):
+        drawn = film(trained, team, chosen.seed, chosen.seconds, out, renderer)
     labels = {"marl": "MARL team", "champion": "champion"}
-    _write(drawn, labels[trained.resolve(chosen.team or "selected")], out, console)
+    _write(drawn, labels[trained.resolve(team)], out, console)
 
 
-class _Drawn(NamedTuple):
-    """A video to be, and what is said of it once it has been drawn."""
-
-    frames: Iterator[Any]
-    total: int
-    fps: float
-    summary: Callable[[], tuple[int, float, str]]  # steps, return, how it ended
-
-
-def _continuous(chosen: Render, trained: Any, seconds: float, renderer: Any) -> _Drawn:
-    from race.viewing.rendering import Episode
-
-    policy = trained.policy(chosen.team or "selected")
-    episode = Episode(trained.task, policy, chosen.seed, seconds, renderer)
-    return _Drawn(
-        episode.frames(),
-        episode.n_frames,
-        episode.fps,
-        lambda: (episode.steps, episode.episode_return, ""),
-    )
-
-
-def _draw_discrete(chosen: Render, trained: Any, seconds: float, out: Path, console: Any) -> _Drawn:
-    if trained.config.task.startswith("micro/"):
-        return _battle_of_run(chosen, trained, seconds, out, console)
-    from race.viewing.stepwise import DiscreteEpisode
-
-    policy = trained.recurrent_policy(chosen.team or "selected")
-    episode = DiscreteEpisode(
-        trained.task, lambda seen: policy(seen.obs, seen.avail_actions), chosen.seed, seconds
-    )
-    return _Drawn(
-        episode.frames(),
-        episode.n_frames,
-        episode.fps,
-        lambda: (episode.steps, episode.episode_return, ""),
-    )
-
-
-def _battle_of_run(chosen: Render, trained: Any, seconds: float, out: Path, console: Any) -> _Drawn:
-    """A battle is a function of its seed and the actions, so it can be played twice."""
-    from race.envs.micro import make
-    from race.envs.micro.recording import replay
-    from race.rollouts.discrete import EpisodeRollouts
-
-    name = trained.resolve(chosen.team or "selected")
-    with (
-        console.status("playing the episode"),
-        EpisodeRollouts(trained.config, trained.task) as rollouts,
-    ):
-        actions = rollouts.episode(trained.encoders[name], trained.heads[name], chosen.seed)
-    if seconds > 0:
-        actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
-    with console.status("playing it again"):
-        played = make(trained.config.task.removeprefix("micro/"))
-        recording = replay(played, actions, chosen.seed)
-    return _recorded(played, recording, out)
-
-
-def _recorded(played: Any, recording: Any, out: Path) -> _Drawn:
-    from race.envs.micro import render
-    from race.envs.micro.canvas import LARGE, SMALL
-
-    ended = recording.verdict or "not finished"
-    return _Drawn(
-        render.frames(played, recording, SMALL if out.suffix.lower() == ".gif" else LARGE),
-        render.n_frames(recording),
-        render.FPS,
-        lambda: (len(recording.returns), float(recording.returns[-1]), ended),
-    )
-
-
-def _write(drawn: _Drawn, who: str, out: Path, console: Any) -> None:
+def _write(drawn: Any, who: str, out: Path, console: Any) -> None:
     from rich.progress import Progress
 
-    from race.cli.progress import rounded
-    from race.viewing.rendering import write_video
+    from race.viewing.filming import write
+    from race.viewing.progress import rounded
 
     with Progress(console=console, transient=True) as bar:
-        drawing = bar.track(drawn.frames, total=drawn.total, description="drawing")
-        count = write_video(iter(drawing), out, drawn.fps)
+        drawing = bar.add_task("drawing", total=drawn.total)
+        count = write(drawn, out, lambda frames: bar.advance(drawing, frames))
     steps, episode_return, ended = drawn.summary()
     print(
         f"{out}: {count} frames, {steps} steps of the {who}, "

@@ -37,12 +37,14 @@ def main(arguments: list[str]) -> None:
     from race.runs import directory as run_directory
     from race.runs.directory import RunDirectory
     from race.runs.results import of_directory
+    from race.training.keeping import kept_teams
 
     if not 0 <= chosen.rows <= 1000:
         raise ConfigError(f"--rows is {chosen.rows}, but it must be from 0 to 1000.")
     found = of_directory(chosen.run_dir)
     config, origin = found.config, found.metadata
     saved = checkpoints.list_checkpoints(RunDirectory(chosen.run_dir).checkpoints)
+    best = [kept.name for kept in kept_teams(chosen.run_dir)]
     shown: dict[str, Any] = {
         "run": run_directory.identity_of(chosen.run_dir),
         "task": config.task,
@@ -50,6 +52,7 @@ def main(arguments: list[str]) -> None:
         "seed": config.seed,
         "finished": run_directory.is_finished(chosen.run_dir),
         "checkpoints": [path.name for path in saved],
+        "best": best,
         "config": settings.to_json(config),
         "metadata": origin,
         "rows": found.rows[len(found.rows) - min(chosen.rows, len(found.rows)) :],
@@ -65,6 +68,7 @@ def main(arguments: list[str]) -> None:
         f"{config.method} on {config.task}, seed {config.seed}",
         f"{state}, {steps:,} of {config.env_steps:,} environment steps in the metrics",
         f"checkpoints: {', '.join(shown['checkpoints']) or 'none'}",
+        *([f"best tested teams, best first: {', '.join(best)}"] if best else []),
         f"identity: {shown['run'] or 'none (of an older version)'}",
         f"begun: {origin.get('started')}, race {origin.get('race')}, algorithm "
         f"{found.algorithm_version}, Python {origin.get('python')}, {origin.get('processor')}",

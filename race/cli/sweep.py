@@ -73,10 +73,10 @@ def _read(file: Path) -> dict[str, Any]:
 
 def _planned(description: dict[str, Any]) -> dict[str, Any]:
     """The resolved configurations by the names of their directories."""
-    from race.cli.train import settled
     from race.config.grid import points, read_grid, with_seed
     from race.config.presets import resolve
     from race.envs import make_task
+    from race.training.asking import settled
 
     grid, tasks, runs = read_grid(description), {}, {}
     for point in points(grid):
@@ -86,7 +86,7 @@ def _planned(description: dict[str, Any]) -> dict[str, Any]:
             tasks[key] = make_task(*key)
         told = ", ".join(f"{name} = {value}" for name, value in point.varied.items())
         try:
-            config = settled(asked, point.preset, point.ablation, tasks[key])  # type: ignore[arg-type]
+            config = settled(asked, point.preset, point.ablation, tasks[key])
         except ConfigError as error:
             raise ConfigError(f"With {told or 'these settings'}: {error}") from error
         for seed in grid.seeds:
@@ -96,7 +96,7 @@ def _planned(description: dict[str, Any]) -> dict[str, Any]:
 
 def _name(config: Any, varied: dict[str, Any]) -> str:
     """What tells a combination from the others, in a directory's name."""
-    from race.cli.train import name_of
+    from race.training.asking import name_of
 
     settings = [
         f"{name.rpartition('.')[2]}={value:.6g}"

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 
 import tyro
 
-from race.config.ablations import AblationName, ablated
+from race.config.ablations import AblationName
 from race.config.cohort import CohortConfig
 from race.config.compute import ComputeConfig
-from race.config.effects import refuse_without_effect
-from race.config.presets import PRESETS, resolve
+from race.config.files import Wanted, read_wanted
+from race.config.presets import resolve
 from race.config.settings import (
     Algo,
     Base,
@@ -25,8 +25,8 @@ from race.config.settings import (
     Preset,
     RaceConfig,
 )
-from race.errors import ConfigError, RunDirectoryError, command, say
-from race.types import AnyTask, DiscreteTask
+from race.errors import ConfigError, RunDirectoryError, command
+from race.types import AnyTask
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,12 @@ class Train:
     accelerators."""
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
+    config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
+    """Settings from a .toml by their names, or from the config.json of a run. Options beside it
+    come on top; TASK may be left out if the file names it."""
+    init_from: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
+    """Begin with the teams of another run in place of random ones: its MARL team as the MARL team,
+    its champion as the first team of the population. Networks must have the same sizes."""
     run_dir: Path | None = None
     """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO; names of
     ablations follow ALGO."""
@@ -75,7 +81,7 @@ class Train:
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments, makes the run directory and trains."""
-    chosen = _parse(arguments)
+    chosen, file = _parse(arguments), _file_of(arguments)
     asked = Config(
         **{
             f.name: getattr(chosen, f.name)
@@ -91,66 +97,51 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.teams.heirloom import heirloom_of
+    from race.training.asking import name_of, settled_with_file, usual_directory
 
     if chosen.seeds is not None:  # this process only watches
         os.environ.update(SHARED_ACCELERATOR)
     use_cache(asked.compute)
     task = make_task(asked.task, asked.env)
-    config = settled(asked, chosen.preset, chosen.ablation, task)
+    name = str(chosen.config)
+    config = settled_with_file(asked, chosen.preset, chosen.ablation, task, file, name)
     if chosen.seeds is None:
         refuse_for_one_run(chosen.jobs, chosen.cohort, "without --seeds. Leave it out.")
-        path = chosen.run_dir or Path("runs") / f"{name_of(config)}-seed{config.seed}"
+        path = chosen.run_dir or usual_directory(config)
         run_directory.refuse_occupied(path)
+        begins_with = heirloom_of(config, task)
         run_directory.create(path, config, describe(task) | tried(asked.task, task))
+        begins_with.hand_to(path)
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
-    _create_all(path, config, chosen, task)
+    _create_all(path, config, chosen, file, task)
     run_all(path, directories_of(path), jobs=chosen.jobs, cohort=chosen.cohort)
 
 
-def settled(
-    asked: Config, preset: Preset, ablation: tuple[AblationName, ...], task: AnyTask
-) -> Config:
-    """What a person asks for, with ablations and all that follows from the task.
-
-    Raises:
-        ConfigError: if something is wrong, has no effect, or does not go together.
-    """
-    from race.algorithms.evolutions import evolution_of
-
-    discrete = isinstance(task, DiscreteTask)
-    asked = ablated(asked, ablation, discrete)
-    _refuse_without_effect(asked, preset, task)
-    config = resolve(asked, discrete=discrete)
-    evolution_of(config.race.evolution)  # an operator that is not there is told of at once
-    return config
-
-
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
-    """What a first look at an environment of the user's own says; others repeat."""
+    """`race.training.asking.tried`, with a word on what takes the time."""
     from race.cli import streams
     from race.envs.own import is_own
-    from race.envs.trial import try_out
+    from race.training import asking
 
     if not is_own(task_id):
-        return {"repeats": True}
+        return asking.tried(task_id, task)
     with streams.console(stderr=True).status("trying the environment"):
-        trial = try_out(task)
-    if trial.note:
-        say(trial.note)
-    return {"repeats": trial.repeats}
+        return asking.tried(task_id, task)
 
 
-def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:
+def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: AnyTask) -> None:
     """Makes the run directories of several seeds, or none."""
     from race.cli.fleet import check_jobs
     from race.config.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.teams.heirloom import heirloom_of
 
     seeds = parse_seeds(str(chosen.seeds))
-    if chosen.seed != 1:
+    if chosen.seed != file.settings.get("seed", 1):
         raise ConfigError("--seed and --seeds are two ways to say it; leave one out.")
     check_jobs(chosen.jobs)
     configs = [resolve(dataclasses.replace(config, seed=seed)) for seed in seeds]
@@ -162,42 +153,44 @@ def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> Non
                 f"`{command('race', 'resume', path)}`, or choose another directory with "
                 "`--run-dir`."
             )
+    begins_with = heirloom_of(config, task)
     described = describe(task) | tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
+        begins_with.hand_to(place)
 
 
 def _parse(arguments: list[str]) -> Train:
     # Twice, because the preset is itself an argument: what it sets is a default, not a command.
-    first = tyro.cli(Train, args=arguments, prog="race train")
-    default = Train(task=first.task, learner=PRESETS[first.preset])
-    return tyro.cli(Train, args=arguments, prog="race train", default=default)
+    file = _file_of(arguments)
+    first = tyro.cli(Train, args=arguments, prog="race train", default=_default(file))
+    file = file._replace(preset=first.preset)
+    named = file._replace(settings={**file.settings, "task": first.task})
+    return tyro.cli(Train, args=arguments, prog="race train", default=_default(named))
 
 
-def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None:
-    from race.envs import reads_config
-
-    discrete = isinstance(task, DiscreteTask)
-    if discrete and preset != "paper":
-        raise ConfigError(
-            f"--preset {preset} has no effect on {asked.task}: its actions are discrete, and the "
-            "presets are of learners of continuous actions. Leave it out; --facmac.* are the "
-            "settings of the learner on this task."
-        )
-    refuse_without_effect(
-        asked,
-        PRESETS[preset],
-        discrete=discrete,
-        reads_env=reads_config(asked.task),
-        on_host=not isinstance(task, DiscreteTask) or task.device is None,
-    )
+def _file_of(arguments: list[str]) -> Wanted:
+    """What the file behind ``--config`` asks for; nothing without one."""
+    for place, word in enumerate(arguments):
+        if word == "--config" and arguments[place + 1 :]:
+            return read_wanted(Path(arguments[place + 1]))
+        if word.startswith("--config="):
+            return read_wanted(Path(word.removeprefix("--config=")))
+    return Wanted({})
 
 
-def name_of(config: Config) -> str:
-    """What a run is called after: its task, method and ablations."""
-    task = config.task.replace("/", "-").replace(":", "-")
-    method = config.method.replace("(", "-").replace(")", "").lower()
-    return "-".join([task, method, *config.ablation])
+def _default(file: Wanted) -> Train:
+    config = file.config
+    shared = {f.name for f in dataclasses.fields(Config)} & {
+        f.name for f in dataclasses.fields(Train)
+    }
+    values = {name: getattr(config, name) for name in shared}
+    values |= {"preset": file.preset, "ablation": file.ablation}
+    default = Train(**values)
+    if "task" not in file.settings:
+        # Past the constructor: it is no text.
+        object.__setattr__(default, "task", tyro.MISSING)
+    return default
 
 
 __all__ = ["Train", "main"]

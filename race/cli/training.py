@@ -6,11 +6,11 @@ from pathlib import Path
 from rich.console import Console
 
 from race.cli import seconds_since_start, streams
-from race.cli.progress import TrainingDisplay
 from race.compilation import use_cache
 from race.config.settings import Config
 from race.errors import command, say
 from race.training.trainer import is_over, train
+from race.viewing.progress import TrainingDisplay
 
 
 def run(path: Path, config: Config, *, extend: bool = False, without_metrics: bool = False) -> None:

@@ -21,6 +21,8 @@ LARGEST_LAYER = 16_384
 """Units of a layer, samples of a batch, teams: more is a slip of the hand."""
 MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
+MOST_KEPT = 1000
+"""Best teams of a run."""
 MOST_JOINTS = 1000
 """Joints between an agent and what it observes: no robot has as many."""
 
@@ -193,6 +195,12 @@ def check(config: Config) -> None:
             "0 or more",
         ),
         (config.checkpoint.keep >= 1, "checkpoint.keep", config.checkpoint.keep, "at least 1"),
+        (
+            0 <= config.checkpoint.keep_best <= MOST_KEPT,
+            "checkpoint.keep-best",
+            config.checkpoint.keep_best,
+            f"from 0 to {MOST_KEPT}",
+        ),
         *numbers.rules(config),
     ]
     _refuse(rules)

@@ -55,12 +55,8 @@ def refuse_without_effect(
     """
     told: dict[str, list[str]] = {}
     facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
-    for name, why in _idle(asked, **facts):
-        group, _, setting = name.rpartition(".")
-        default = defaults if group == "learner" else _DEFAULTS.get(group)
-        value = getattr(getattr(asked, group) if group else asked, setting)
-        if value != (None if default is None else getattr(default, setting)):
-            told.setdefault(why, []).append(f"--{name.replace('_', '-')}")
+    for name, why in without_effect(asked, defaults, **facts).items():
+        told.setdefault(why, []).append(f"--{name.replace('_', '-')}")
     if told:
         sentences = [
             f"{' and '.join(names)} would have no effect {w}." for w, names in told.items()
@@ -68,7 +64,35 @@ def refuse_without_effect(
         raise ConfigError(f"{' '.join(sentences)} Leave out what has no effect.")
 
 
-_DEFAULTS: dict[str, Any] = {"facmac": FacmacConfig(), "race": RaceConfig(), "env": EnvConfig()}
+def without_effect(
+    asked: Config, defaults: LearnerConfig, *, discrete: bool, reads_env: bool, on_host: bool
+) -> dict[str, str]:
+    """The settings that are not what they usually are, though nothing would read them; and why."""
+    found: dict[str, str] = {}
+    for name, why in _idle(asked, discrete=discrete, reads_env=reads_env, on_host=on_host):
+        if name not in found and setting(asked, name) != usual(name, defaults):
+            found[name] = why
+    return found
+
+
+def setting(config: Config, name: str) -> Any:
+    """The value of a setting, such as ``race.evolution``."""
+    group, _, field = name.rpartition(".")
+    return getattr(getattr(config, group) if group else config, field)
+
+
+def usual(name: str, defaults: LearnerConfig) -> Any:
+    """The value of a setting that nobody asked for."""
+    group, _, field = name.rpartition(".")
+    return getattr(defaults if group == "learner" else _DEFAULTS[group], field)
+
+
+_DEFAULTS: dict[str, Any] = {
+    "": Config(""),
+    "facmac": FacmacConfig(),
+    "race": RaceConfig(),
+    "env": EnvConfig(),
+}
 
 
 def _idle(

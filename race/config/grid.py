@@ -75,14 +75,14 @@ def read_grid(description: Mapping[str, Any]) -> Grid:
     """
     rest = dict(description)
     sweep = rest.pop("sweep", {})
-    _refuse_unknown("sweep", sweep, ("draws", "seed"))
+    refuse_unknown("sweep", sweep, ("draws", "seed"))
     draws, draw_seed = sweep.get("draws"), sweep.get("seed", 0)
     for name, value in (("draws", draws), ("seed", draw_seed)):
         if value is not None and not (type(value) is int and value >= (name == "draws")):
             raise ConfigError(f"sweep.{name} is {value!r}, but must be a whole number.")
     seeds = _seeds(rest.pop("seeds", [1]))
     known = (*TOP, *GROUPS, "preset", "ablation")
-    _refuse_unknown("", rest, known)
+    refuse_unknown("", rest, known)
     if "task" not in rest:
         raise ConfigError('The file names no task, such as task = "probe/target".')
     hints = get_type_hints(Config)
@@ -93,7 +93,7 @@ def read_grid(description: Mapping[str, Any]) -> Grid:
     for group in GROUPS:
         settings = rest.get(group, {})
         of_group = get_type_hints(hints[group])
-        _refuse_unknown(group, settings, tuple(of_group))
+        refuse_unknown(group, settings, tuple(of_group))
         axes += [_axis(f"{group}.{n}", v, of_group[n], draws) for n, v in settings.items()]
     return Grid(tuple(axes), seeds, draws, draw_seed)
 
@@ -168,7 +168,7 @@ def _axis(name: str, value: Any, hint: Any, draws: int | None) -> Axis:
         return Axis(name, _range(name, value, hint, draws))
     alone = tupled(value)
     if fits(alone, hint):
-        return Axis(name, (_exact(alone, hint),))
+        return Axis(name, (exact(alone, hint),))
     if isinstance(value, list) and value:
         choices = tuple(map(tupled, value))
         for choice in choices:
@@ -176,17 +176,17 @@ def _axis(name: str, value: Any, hint: Any, draws: int | None) -> Axis:
                 raise ConfigError(f"{name} has {choice!r} among its values, which it cannot be.")
         if len(set(map(repr, choices))) < len(choices):
             raise ConfigError(f"{name} names a value twice: {value!r}.")
-        return Axis(name, tuple(_exact(choice, hint) for choice in choices))
+        return Axis(name, tuple(exact(choice, hint) for choice in choices))
     raise ConfigError(f"{name} is {value!r}, which it cannot be.")
 
 
-def _exact(value: Any, hint: Any) -> Any:
+def exact(value: Any, hint: Any) -> Any:
     """A whole number where a float is meant is one."""
     return float(value) if hint is float else value
 
 
 def _range(name: str, value: dict[str, Any], hint: Any, draws: int | None) -> Range:
-    _refuse_unknown(name, value, ("from", "to", "scale"))
+    refuse_unknown(name, value, ("from", "to", "scale"))
     low, high, scale = value.get("from"), value.get("to"), value.get("scale", "linear")
     numbers = all(type(v) in (int, float) for v in (low, high))
     if not numbers or not low < high or scale not in ("linear", "log"):  # type: ignore[operator]
@@ -230,7 +230,12 @@ def _seeds(value: Any) -> tuple[int, ...]:
     return tuple(seeds)
 
 
-def _refuse_unknown(group: str, settings: Any, known: tuple[str, ...]) -> None:
+def refuse_unknown(group: str, settings: Any, known: tuple[str, ...]) -> None:
+    """Refuses a table with other settings than the known ones.
+
+    Raises:
+        ConfigError: naming the first, and what it may have been meant to be.
+    """
     if not isinstance(settings, dict):
         raise ConfigError(f"{group} is {settings!r}, but must be a table: [{group}].")
     for name in settings:

@@ -57,6 +57,13 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
     Raises:
         ConfigError: naming the first setting that cannot work, and what would.
     """
+    config = filled(config, discrete)
+    check(config)
+    return config
+
+
+def filled(config: Config, discrete: bool | None = None) -> Config:
+    """What was left to presets filled in, whether it can work or not."""
     discrete = config.discrete if discrete is None else discrete
     if config.task.startswith("mamujoco/"):
         # The library spells partitions of Humanoid with a bar, the paper's tasks with an x.
@@ -93,7 +100,7 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
     learner = config.learner
     if base != "matd3":
         learner = dataclasses.replace(learner, policy_delay=1, smoothing_noise=0.0)
-    config = dataclasses.replace(
+    return dataclasses.replace(
         config,
         race=race,
         base=base,
@@ -102,8 +109,6 @@ def resolve(config: Config, discrete: bool | None = None) -> Config:
         facmac=facmac,
         evaluation=evaluation,
     )
-    check(config)
-    return config
 
 
 def _usual_base(discrete: bool) -> Base:

@@ -272,6 +272,8 @@ class CheckpointConfig:
     """Wall time between checkpoints; 0 writes one at every opportunity (100 gradient steps)."""
     keep: int = 2
     """Newest checkpoints kept."""
+    keep_best: int = 0
+    """Best tested teams kept besides, in DIR/best: the teams alone, without what goes on."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +288,8 @@ class Config:
     discrete: bool = False
     seed: int = 1
     env_steps: int = 1_000_000
+    init_from: str | None = None
+    """The run whose teams it began with, in place of random ones."""
     learner: LearnerConfig = field(default_factory=LearnerConfig)
     facmac: FacmacConfig = field(default_factory=FacmacConfig)
     race: RaceConfig = field(default_factory=RaceConfig)
@@ -379,6 +383,8 @@ _BEFORE: dict[str, Any] = {
     "evolution_from": 0,
     "random_steps_owed": False,
     "compute": ComputeConfig(),
+    "keep_best": 0,
+    "init_from": None,
 }
 
 

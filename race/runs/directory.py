@@ -59,6 +59,16 @@ class RunDirectory:
         return self.path / "checkpoints"
 
     @property
+    def best(self) -> Path:
+        """The folder of the best tested teams."""
+        return self.path / "best"
+
+    @property
+    def init(self) -> Path:
+        """The teams of another run that it began with."""
+        return self.path / "init.safetensors"
+
+    @property
     def done(self) -> Path:
         """Exists once the run has used its whole budget."""
         return self.path / "DONE"

@@ -39,6 +39,8 @@ def settings(config: Config) -> dict[str, Any]:
     # Ablations are names for settings that are there anyway.
     for name in ("seed", "env_steps", "checkpoint", "ablation"):
         del kept[name]
+    if kept["init_from"] is None:
+        del kept["init_from"]
     for name in ("processes", "retries", "step_seconds"):
         del kept["env"][name]
     if not config.has_population:

@@ -63,6 +63,14 @@ def restore(template: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
     return jax.tree_util.tree_map_with_path(value, template)
 
 
+def blank(shapes: Any) -> Any:
+    """Zeros, without memory of their own, for the shapes that `jax.eval_shape` tells."""
+    return jax.tree.map(
+        lambda leaf: leaf if callable(leaf) else np.broadcast_to(leaf.dtype.type(0), leaf.shape),
+        shapes,
+    )
+
+
 def _host(name: str, leaf: Any) -> NDArray[Any]:
     if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
         leaf = jax.random.key_data(leaf)

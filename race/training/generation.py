@@ -11,10 +11,12 @@ import jax
 import jax.numpy as jnp
 
 from race import programs
+from race.algorithms.base import Tested
 from race.config.settings import Config
 from race.errors import DivergenceError
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
+from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
 from race.training.run_state import Progress, RunState
@@ -138,12 +140,14 @@ def inject(run: Run, state: RunState) -> RunState:
 def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
     """Plays the test episodes of some runs and writes their rows."""
     groups: list[list[Trial]] = []
+    teams: list[tuple[Tested, ...]] = []
     for run, state in zip(runs, states, strict=True):
         run.report("evaluation", state.progress, {})
         episodes = run.config.evaluation.episodes
         assert episodes is not None
         seeds = host_seeds(run.config.seed, Purpose.EVALUATION, state.progress.generation, episodes)
         tested = run.algorithm.tested(state.algorithm, run.task.spec)
+        teams.append(tested)
         groups.append([Trial(encoder, heads, seeds) for encoder, heads in tested])
     rollouts = runs[0].rollouts
     before = rollouts.repeated
@@ -154,7 +158,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
     # Of several runs failures are not told apart: each that took part counts all.
     repeated = rollouts.repeated - before
     after = []
-    for run, state, found in zip(runs, states, scores, strict=True):
+    for run, state, tested, found in zip(runs, states, teams, scores, strict=True):
         progress = state.progress
         progress = stamped(
             run,
@@ -162,6 +166,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
         )
         row = evaluation_row(progress, found)
         run.metrics.write(row)
+        keep_best(run, tested, found, progress)
         run.report("evaluation", progress, row)
         after.append(state._replace(progress=progress))
     return after

@@ -55,6 +55,10 @@ class Interrupts:
     ) -> None:
         give_back(self._previous)
 
+    def stop(self) -> None:
+        """The same wish, from within the program."""
+        self.requested = True
+
     def _request(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
         give_back(self._previous)

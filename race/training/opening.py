@@ -17,6 +17,7 @@ from race.runs import metrics as metrics_file
 from race.runs.directory import RunDirectory
 from race.runs.metrics import MetricsWriter, set_aside
 from race.training.clock import Clock
+from race.training.inheriting import inherit
 from race.training.interrupts import Interrupts
 from race.training.records import lost_row
 from race.training.run import Report, Run, silent
@@ -92,6 +93,9 @@ def begin(
         if saved is None:
             check_version(origin.get("algorithm_version", 1) if origin else None)
             state = fresh(config, task.spec, algorithm, rollouts.empty_replay(config))
+            if config.init_from is not None:
+                begun = inherit(path, state.algorithm, config, task.spec)
+                state = state._replace(algorithm=begun)
         else:
             # An empty buffer beside the full one would take as much memory again.
             shapes = jax.eval_shape(lambda: rollouts.empty_replay(config))

@@ -20,7 +20,7 @@ from race.replay.buffer import Replay
 from race.runs import checkpoints
 from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
 from race.runs.metrics import Extent
-from race.runs.trees import flatten, restore
+from race.runs.trees import blank, flatten, restore
 from race.training.run import Run, stamped
 from race.training.run_state import Progress, RunState, statics
 from race.types import Spec
@@ -138,13 +138,49 @@ def learned_of(
     Raises:
         CheckpointError: if it was written by a run with other networks or another task.
     """
-    key = root_key(config.seed, Purpose.INIT)
-    template = {
-        "algorithm": start(key, hyper=hyper_of(config), **statics(config, spec, algorithm)),
-        "losses": empty_losses(algorithm),
-    }
+    template = _fresh(config, spec, algorithm)
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
     return copy(restore(template, _as_now(saved.arrays, template)))
+
+
+def looked_at(saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm) -> Any:
+    """The algorithm's state that a checkpoint holds, to look at and not to go on with.
+
+    No program is compiled for it, so that a team is there at once.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+    template = blank(jax.eval_shape(lambda: _fresh(config, spec, algorithm)))
+    return _on_device(restore(template, _as_now(saved.arrays, template))["algorithm"])
+
+
+def one_of(
+    saved: Checkpoint, name: str, config: Config, spec: Spec, algorithm: Algorithm
+) -> tuple[Any, Any]:
+    """Encoders and heads of the one team that a kept file holds.
+
+    Raises:
+        CheckpointError: if it was written by a run with other networks or another task.
+    """
+
+    def tested() -> dict[str, Any]:
+        groups = algorithm.tested(_fresh(config, spec, algorithm)["algorithm"], spec)
+        (found,) = ((group.encoder, group.heads[name]) for group in groups if name in group.heads)
+        return {"encoder": found[0], "head": found[1]}
+
+    restored = _on_device(restore(blank(jax.eval_shape(tested)), saved.arrays))
+    return restored["encoder"], restored["head"]
+
+
+def _fresh(config: Config, spec: Spec, algorithm: Algorithm) -> dict[str, Any]:
+    key = root_key(config.seed, Purpose.INIT)
+    state = start(key, hyper=hyper_of(config), **statics(config, spec, algorithm))
+    return {"algorithm": state, "losses": empty_losses(algorithm)}
+
+
+def _on_device(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf if callable(leaf) else jnp.asarray(leaf), tree)
 
 
 # Arrays of a population, by the names they had before it was a part of its own.

@@ -36,6 +36,7 @@ def train(
     without_metrics: bool = False,
     report: Report = silent,
     began: float | None = None,
+    interrupts: Interrupts | None = None,
 ) -> Progress:
     """Trains in ``path``: from the newest checkpoint if there is one, else from the start.
 
@@ -49,19 +50,24 @@ def train(
         without_metrics: whether to go on with new metrics, because those before are lost.
         report: told what is going on.
         began: `time.perf_counter` when the process began.
+        interrupts: by whose `stop` the run is to be saved and left, as by Ctrl-C.
 
     Raises:
         RaceError: each with a message for the user; see the subclasses in `race.errors`.
     """
     order = Order(path, config, extend, without_metrics, report)
-    (result,) = train_cohort([order], began=began)
+    (result,) = train_cohort([order], began=began, interrupts=interrupts)
     if isinstance(result, RaceError):
         raise result
     return result
 
 
 def train_cohort(
-    orders: Sequence[Order], *, batching: Batching = "auto", began: float | None = None
+    orders: Sequence[Order],
+    *,
+    batching: Batching = "auto",
+    began: float | None = None,
+    interrupts: Interrupts | None = None,
 ) -> list[Progress | RaceError]:
     """The same for several runs at once, in lockstep.
 
@@ -71,6 +77,7 @@ def train_cohort(
         orders: runs of one `race.training.cohort.kind_of`.
         batching: whether they are one program.
         began: `time.perf_counter` when the process began.
+        interrupts: by whose `stop` all are to be saved and left.
 
     Returns:
         How far each came, or what ended it.
@@ -94,11 +101,11 @@ def train_cohort(
     with (
         rollouts_of(config, task, proven=proven, runs=len(orders), together=as_one) as rollouts,
         ExitStack() as files,
-        Interrupts() as interrupts,
+        interrupts or Interrupts() as listening,
     ):
         for place, (order, path) in enumerate(zip(orders, paths, strict=True)):
             try:
-                begun = begin(order, path, task, rollouts, interrupts, files, began)
+                begun = begin(order, path, task, rollouts, listening, files, began)
             except RaceError as error:
                 results[place] = released(error) if len(orders) > 1 else error
                 continue

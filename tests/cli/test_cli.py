@@ -16,10 +16,10 @@ from commands import alone, fails, race
 from PIL import Image
 
 from race.cli import COMMANDS
-from race.cli.progress import TrainingDisplay
 from race.config.settings import Config
 from race.runs import checkpoints, metrics
 from race.runs import directory as run_directory
+from race.viewing.progress import TrainingDisplay
 
 SMALL = (
     "--env-steps 120 --learner.random-steps 40 --learner.hidden-sizes 12 8 --learner.batch-size 8 "

@@ -52,6 +52,7 @@ _SETTINGS: dict[str, str] = {
     "evaluation.episodes": "0 -1 16385 1000000000000",
     "checkpoint.minutes": "-1 nan inf",
     "checkpoint.keep": "0 -1 99999999999",
+    "checkpoint.keep-best": "-1 1001",
 }
 _MATCHING = "train probe/matching "
 _FACMAC: dict[str, str] = {

@@ -1,0 +1,120 @@
+"""Films of trained teams: the right renderer for each kind of task."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from race.envs.micro import make
+from race.envs.micro.recording import Recording, replay
+from race.rollouts.discrete import EpisodeRollouts
+from race.teams.trained import Trained
+from race.types import DiscreteTask, Task
+from race.viewing.rendering import Episode, Renderer, choose_renderer, write_video
+from race.viewing.stepwise import DiscreteEpisode
+
+SECONDS = 15.0
+"""Of an episode with continuous actions that are shown, unless asked otherwise."""
+STEPS_PER_SECOND = 2
+"""Of a battle, at the game's "normal" speed."""
+
+
+class Film(NamedTuple):
+    """A video to be, and what is said of it once it has been drawn."""
+
+    frames: Iterator[Any]
+    total: int
+    fps: float
+    summary: Callable[[], tuple[int, float, str]]  # steps, return, how it ended
+
+
+def film(
+    trained: Trained,
+    team: str,
+    seed: int,
+    seconds: float | None,
+    out: Path,
+    renderer: Renderer | None = None,
+) -> Film:
+    """An episode of a team, to be drawn as its frames are asked for.
+
+    Args:
+        trained: the teams of a run.
+        team: ``marl``, ``champion`` or ``selected``.
+        seed: of the episode.
+        seconds: simulated time to show; 0 for the whole episode. None: `SECONDS`, of discrete
+            actions the whole episode.
+        out: where it will be written, whose ending says how large pictures are.
+        renderer: what draws MuJoCo. None: what is found.
+
+    Raises:
+        RaceError: if it cannot be played or drawn.
+    """
+    if isinstance(trained.task, Task):
+        chosen = choose_renderer() if renderer is None else renderer
+        shown = SECONDS if seconds is None else seconds
+        return _drawn(Episode(trained.task, trained.policy(team), seed, shown, chosen))
+    shown = seconds or 0.0
+    if trained.config.task.startswith("micro/"):
+        return _battle(trained, team, seed, shown, out)
+    policy = trained.recurrent_policy(team)
+    return _drawn(
+        DiscreteEpisode(
+            trained.task, lambda seen: policy(seen.obs, seen.avail_actions), seed, shown
+        )
+    )
+
+
+def write(drawn: Film, out: Path, each: Callable[[int], None] = lambda frames: None) -> int:
+    """Plays, draws and writes a film; returns the number of frames.
+
+    Args:
+        drawn: the film.
+        out: an .mp4 or .gif.
+        each: told whenever a frame has been drawn.
+
+    Raises:
+        RaceError: if it cannot be played, drawn or written.
+    """
+
+    def frames() -> Iterator[Any]:
+        for frame in drawn.frames:
+            each(1)
+            yield frame
+
+    return write_video(frames(), out, drawn.fps)
+
+
+def _drawn(episode: Any) -> Film:
+    return Film(
+        episode.frames(),
+        episode.n_frames,
+        episode.fps,
+        lambda: (episode.steps, episode.episode_return, ""),
+    )
+
+
+def _battle(trained: Trained, team: str, seed: int, seconds: float, out: Path) -> Film:
+    """A battle is a function of its seed and the actions, so it can be played twice."""
+    assert isinstance(trained.task, DiscreteTask)
+    name = trained.resolve(team)
+    with EpisodeRollouts(trained.config, trained.task) as rollouts:
+        actions = rollouts.episode(trained.encoders[name], trained.heads[name], seed)
+    if seconds > 0:
+        actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
+    played = make(trained.config.task.removeprefix("micro/"))
+    return of_battle(played, replay(played, actions, seed), out)
+
+
+def of_battle(played: Any, recording: Recording, out: Path) -> Film:
+    """A film of a battle that was recorded."""
+    from race.envs.micro import render
+    from race.envs.micro.canvas import LARGE, SMALL
+
+    ended = recording.verdict or "not finished"
+    return Film(
+        render.frames(played, recording, SMALL if out.suffix.lower() == ".gif" else LARGE),
+        render.n_frames(recording),
+        render.FPS,
+        lambda: (len(recording.returns), float(recording.returns[-1]), ended),
+    )
