@@ -3,6 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
 
 from race.envs.micro.units import GROUND, UNIT_TYPES, Mover, UnitType
@@ -45,25 +46,31 @@ def place(cells: NDArray[Any], name: str, groups: tuple[Group, ...]) -> tuple[St
         TaskError: if there is not enough room.
     """
     placed: list[Start] = []
+    # Place and radius of those of each plane, for all of them at once.
+    taken: dict[Mover, NDArray[np.float64]] = {}
     for group in groups:
         unit = UNIT_TYPES[group.unit]
         x, y = group.x, group.y
         if "structure" in unit.attributes:  # its 2 x 2 footprint snaps to the grid
             x, y = float(round(x)), float(round(y))
-        step = 2 * unit.radius
-        found = 0
+        step, plane = 2 * unit.radius, _plane(unit)
+        others = taken.get(plane, np.zeros((0, 3)))
+        room = np.concatenate([others, np.zeros((group.size, 3))])
+        count = begun = len(others)
         for i, j in _lattice(int(max(cells.shape) / step) + 1):
             start = Start(group.unit, x + i * step, y + j * step)
-            if _fits(cells, unit, start, placed):
+            if _fits(cells, unit, start, room[:count]):
                 placed.append(start)
-                found += 1
-            if found == group.size:
+                room[count] = start.x, start.y, unit.radius
+                count += 1
+            if count - begun == group.size:
                 break
         else:
             raise TaskError(
-                f"Map {name}: there is room for only {found} of {group.size} {group.unit} "
+                f"Map {name}: there is room for only {count - begun} of {group.size} {group.unit} "
                 f"round ({group.x:g}, {group.y:g})."
             )
+        taken[plane] = room
     return tuple(placed)
 
 
@@ -78,19 +85,15 @@ def _lattice(reach: int) -> list[tuple[int, int]]:
     return sorted(points, key=order)
 
 
-def _fits(cells: NDArray[Any], unit: UnitType, start: Start, placed: list[Start]) -> bool:
+def _fits(cells: NDArray[Any], unit: UnitType, start: Start, others: NDArray[np.float64]) -> bool:
     x, y = math.floor(start.x), math.floor(start.y)
     width, height = cells.shape
     if not (0 <= x < width and 0 <= y < height):
         return False
     if unit.mover is not Mover.AIR and cells[x, y] != GROUND:
         return False
-    return all(
-        math.hypot(start.x - other.x, start.y - other.y)
-        >= unit.radius + UNIT_TYPES[other.unit].radius - 1e-6
-        for other in placed
-        if _plane(UNIT_TYPES[other.unit]) == _plane(unit)
-    )
+    apart = np.hypot(start.x - others[:, 0], start.y - others[:, 1])
+    return bool(np.all(apart >= unit.radius + others[:, 2] - 1e-6))
 
 
 def _plane(unit: UnitType) -> Mover:
