@@ -173,7 +173,7 @@ def _parse(arguments: list[str]) -> Train:
 
 
 def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None:
-    from race.envs import reads_config
+    from race.envs import reads_config, reads_team
 
     discrete = isinstance(task, DiscreteTask)
     if discrete and preset != "paper":
@@ -187,6 +187,7 @@ def _refuse_without_effect(asked: Config, preset: Preset, task: AnyTask) -> None
         PRESETS[preset],
         discrete=discrete,
         reads_env=reads_config(asked.task),
+        reads_parallel=reads_team(asked.task),
         on_host=not isinstance(task, DiscreteTask) or task.device is None,
     )
 
