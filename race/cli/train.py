@@ -128,16 +128,21 @@ def settled(
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """What a first look at an environment of the user's own says; others repeat."""
     from race.cli import streams
+    from race.envs import pettingzoo
     from race.envs.own import is_own
     from race.envs.trial import try_out
 
-    if not is_own(task_id):
+    foreign = task_id.startswith(pettingzoo.PREFIX)
+    if not is_own(task_id) and not foreign:
         return {"repeats": True}
     with streams.console(stderr=True).status("trying the environment"):
         trial = try_out(task)
     if trial.note:
         say(trial.note)
-    return {"repeats": trial.repeats}
+    found: dict[str, Any] = {"repeats": trial.repeats, "conflict": trial.conflict}
+    if foreign:
+        found["packages"] = pettingzoo.packages(task_id.removeprefix(pettingzoo.PREFIX))
+    return found
 
 
 def _create_all(path: Path, config: Config, chosen: Train, task: AnyTask) -> None:

@@ -196,8 +196,8 @@ def refuse_idle(avail_actions: Bool[np.ndarray, "N A"]) -> None:
     offered = avail_actions.any(axis=1)
     if not offered.all():
         raise HandedOverError(
-            f"no action is available to agent {offered.argmin()}. Give every agent one that does nothing, "
-            "also when it is dead and after the last step"
+            f"no action is available to agent {offered.argmin()}. Give every agent one that does "
+            "nothing, also when it is dead and after the last step"
         )
 
 

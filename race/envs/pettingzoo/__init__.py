@@ -66,7 +66,8 @@ def parallel_task(
         TaskError: if the environment is none that can be learned, or its step limit is not known.
     """
     called = str(task or getattr(make, "__name__", "of yours"))
-    with blamed(TaskError, f"Task {called}: making its environment failed"), _told(called):
+    how = f" with --env.kwargs {config.kwargs}" if called.startswith(PREFIX) else ""
+    with blamed(TaskError, f"Task {called}: making its environment{how} failed"), _told(called):
         env = source.made(make, None)
     try:
         name = task or str((getattr(env, "metadata", None) or {}).get("name", type(env).__name__))

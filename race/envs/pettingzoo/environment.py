@@ -208,7 +208,7 @@ class TeamEnv(gymnasium.Env[Any, Any]):
             state = np.concatenate([own, state]) if self._reaches else own.copy()
         if self._reaches:
             return state
-        obs = np.zeros((len(team), self.obs_size), np.float32)
+        obs = np.zeros((len(team), self.obs_size), np.float32)  # padded
         for row, number in zip(obs, self._places if everybody else range(len(team)), strict=True):
             row[: len(seen[number])] = seen[number]
         self._available = parallel.available()

@@ -18,6 +18,8 @@ from race.errors import HandedOverError, TaskError
 from race.types import LARGEST
 
 _METHODS: Final = ("reset", "step", "observation_space", "action_space")
+_SEVERAL: Final = (tuple, list)
+_BY_AGENT: Final = (dict, Mapping)  # the first is what it almost always is, and told apart sooner
 
 Other = Callable[[Any, Any, Any, np.random.Generator], Any]
 """``other(agent, observation, action_space, random) -> action`` of an agent outside the team."""
@@ -105,6 +107,7 @@ class Parallel:
         self.seeded = takes(env.reset, seed=0)
         self.rewards = [0.0] * len(self.team)
         self._other, self._turns = other, turns
+        self._known = frozenset(self.agents)
         self._nothing = {a: np.zeros(sight.size, np.float32) for a, sight in self.sights.items()}
         counts = [move.count for move in self.moves.values() if isinstance(move, Choices)]
         self._all_choices = np.arange(max(counts, default=0)) < np.array(counts)[:, None]
@@ -126,11 +129,7 @@ class Parallel:
         for space in self._other_spaces.values():
             space.seed(int(self._random.integers(2**31)))
         answer = self.env.reset(seed=seed) if self.seeded and seed is not None else self.env.reset()
-        if not (
-            isinstance(answer, tuple | list)
-            and len(answer) == 2
-            and all(isinstance(part, Mapping) for part in answer)
-        ):
+        if not _are_dictionaries(answer, 2):
             raise HandedOverError(
                 f"reset returned {contract.came(answer)} instead of the pair (observations, infos) "
                 "of dictionaries by agent. Let it end with `return observations, infos`"
@@ -160,11 +159,7 @@ class Parallel:
             if agent in before:
                 given[agent] = self._other_action(agent)
         answer = self.env.step(given)
-        if not (
-            isinstance(answer, tuple | list)
-            and len(answer) == 5
-            and all(isinstance(part, Mapping) for part in answer)
-        ):
+        if not _are_dictionaries(answer, 5):
             raise HandedOverError(
                 f"step returned {contract.came(answer)} instead of five dictionaries by agent: "
                 "observations, rewards, terminations, truncations, infos"
@@ -174,19 +169,20 @@ class Parallel:
             contract.payment(_of(rewards, agent, "reward"), str(agent)) if agent in before else 0.0
             for agent in self.team
         ]
-        ended = {
-            agent: (
-                _flag(terminations, agent, "termination"),
-                _flag(truncations, agent, "truncation"),
-            )
-            for agent in before
-        }
-        living = self._living()
-        self._present = {agent for agent in living if not any(ended.get(agent, (False, False)))}
+        ended, cut = set(), set()
+        for agent in before:
+            terminated = _flag(terminations, agent, "termination")
+            truncated = _flag(truncations, agent, "truncation")
+            if terminated or truncated:
+                ended.add(agent)
+                if not terminated:
+                    cut.add(agent)
+        self._present = set(self._living()) - ended
         self._refuse_unseen()
-        cut = {agent for agent, (terminated, truncated) in ended.items() if truncated > terminated}
-        self._choosing = self._present | (cut & set(self._observations))
-        return self._end(before, {agent: ended[agent] for agent in ended if any(ended[agent])}, cut)
+        self._choosing = self._present | (cut & set(self._observations)) if cut else self._present
+        if any(agent in self._present for agent in self.team):
+            return End(terminated=False, truncated=False)
+        return self._end(before, ended, cut)
 
     def seen(
         self, agents: Sequence[Any]
@@ -235,9 +231,7 @@ class Parallel:
                 found[number, : move.count] = move.available(mask)
         return found
 
-    def _end(self, before: set[Any], ended: Mapping[Any, tuple[bool, bool]], cut: set[Any]) -> End:
-        if self._present & set(self.team):
-            return End(False, False)
+    def _end(self, before: set[Any], ended: set[Any], cut: set[Any]) -> End:
         last = [agent for agent in self.team if agent in before]
         if not any(agent in ended for agent in last):
             raise HandedOverError(
@@ -254,8 +248,8 @@ class Parallel:
                 f"agents is {contract.came(living)}, but must be the list of the agents that are "
                 "there, from reset on"
             )
-        strange = [agent for agent in living if agent not in self.sights]
-        if strange:
+        if not self._known.issuperset(living):
+            strange = [agent for agent in living if agent not in self._known]
             raise HandedOverError(
                 f"agents has {_listed(strange)}, not one of possible_agents. Let possible_agents "
                 "name all that may ever come"
@@ -294,6 +288,14 @@ class Parallel:
         if mask is None or not isinstance(space, spaces.Discrete):
             return space.sample()
         return space.sample(np.asarray(mask, np.int8))
+
+
+def _are_dictionaries(answer: Any, count: int) -> bool:
+    return (
+        isinstance(answer, _SEVERAL)
+        and len(answer) == count
+        and all(isinstance(part, _BY_AGENT) for part in answer)
+    )
 
 
 def _flag(flags: Mapping[Any, Any], agent: Any, what: str) -> bool:

@@ -8,13 +8,12 @@ import inspect
 import json
 import os
 import pkgutil
-import types
 from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
 from race import loading
-from race.envs import contract
-from race.errors import TaskError
+from race.envs import mamujoco
+from race.errors import TaskError, blamed
 
 PREFIX: Final = "pettingzoo:"
 """What the ids of such tasks begin with."""
@@ -41,17 +40,21 @@ def maker(name: str) -> Callable[..., Any]:
         TaskError: if there is none.
     """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # an advertisement
-    found = _found(name)
-    if isinstance(found, types.ModuleType):
-        made = [getattr(found, one) for one in _MAKERS if callable(getattr(found, one, None))]
-        if made:
-            maker_: Callable[..., Any] = made[0]
-            return maker_
-    elif callable(found):
+    with _quiet(name):
+        found = _found(name)
+    if callable(found):
         return found
+    with blamed(TaskError, f"Task {PREFIX}{name}"):  # outdated names of PettingZoo say so here
+        made = [getattr(found, one) for one in _MAKERS if callable(getattr(found, one, None))]
+    if made:
+        maker_: Callable[..., Any] = made[0]
+        return maker_
+    inside = sorted(info.name for info in pkgutil.iter_modules(getattr(found, "__path__", [])))
+    shown = [module for module in inside if not module.startswith("_")]
+    hint = f" Its modules are {', '.join(shown)}." if shown else ""
     raise TaskError(
-        f"Task {PREFIX}{name}: {name} is {contract.came(found)}, but must be a module with a "
-        "function parallel_env (or env), or a function or class that makes the environment."
+        f"Task {PREFIX}{name}: {name} has no function parallel_env (or env). Name a module that "
+        f"has, or a function or class that makes the environment.{hint}"
     )
 
 
@@ -67,18 +70,18 @@ def from_name(name: str, kwargs: str, render_mode: str | None = None) -> Any:
             "render_mode is no argument for --env.kwargs: training draws nothing, and `race "
             "render` asks for pictures itself."
         )
-    return made(maker(name), render_mode, given)
+    if render_mode is not None:
+        given["render_mode"] = render_mode
+    with _quiet(name):
+        return maker(name)(**given)
 
 
-def made(
-    make: Callable[..., Any], render_mode: str | None, kwargs: dict[str, Any] | None = None
-) -> Any:
-    """What a function makes. The render mode is handed on if there is one, or a place without one.
+def made(make: Callable[..., Any], render_mode: str | None) -> Any:
+    """What a function of the user's makes, which need not have a place for the render mode.
 
     Raises:
-        TaskError: if it has no place for a render mode that is wanted.
+        TaskError: if it has none and one is wanted.
     """
-    kwargs = dict(kwargs or {})
     try:
         parameters = list(inspect.signature(make).parameters.values())
     except (TypeError, ValueError):  # one of those that cannot be known
@@ -86,21 +89,19 @@ def made(
     required = [
         p
         for p in parameters
-        if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
-        and p.default is p.empty
-        and p.name not in kwargs
+        if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD) and p.default is p.empty
     ]
     named = any(p.name == "render_mode" or p.kind is p.VAR_KEYWORD for p in parameters)
     if len(required) == 1:  # make(render_mode), as of other tasks
-        return make(render_mode, **kwargs)
+        return make(render_mode)
     if render_mode is None:
-        return make(**kwargs)
+        return make()
     if not named:
         raise TaskError(
             "Its make function takes no render_mode, and pictures need one. Let it take "
             "render_mode=None and hand it on to the environment."
         )
-    return make(render_mode=render_mode, **kwargs)
+    return make(render_mode=render_mode)
 
 
 def opened(env: Any) -> Opened:
@@ -147,6 +148,12 @@ def packages(name: str) -> dict[str, str]:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[package] = importlib.metadata.version(package.replace("_", "-"))
     return found
+
+
+def _quiet(name: str) -> contextlib.AbstractContextManager[None]:
+    """Keeps back what a library is known to say without need."""
+    ours = name.startswith("gymnasium_robotics.")
+    return mamujoco.quiet() if ours else contextlib.nullcontext()
 
 
 def _holders(env: Any) -> Iterator[Any]:
