@@ -15,9 +15,10 @@ import pytest
 from commands import alone, fails, race
 from PIL import Image
 
-from race.cli import COMMANDS
+from race.cli import COMMANDS, streams
 from race.cli.progress import TrainingDisplay
 from race.config.settings import Config
+from race.envs import task_ids
 from race.runs import checkpoints, metrics
 from race.runs import directory as run_directory
 
@@ -215,9 +216,26 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(listing["algorithms"]) == {"race", "merl", "ea", "matd3", "maddpg", "facmac"}
     assert "vmm-only" in listing["ablations"]
     race("list")
-    table = capsys.readouterr().out
-    assert "mamujoco/HumanoidStandup-9x8" in table
-    assert "micro/so_many_baneling" in table
+    lines = capsys.readouterr().out.splitlines()  # nobody reads at a terminal
+    found = {line.split("\t")[0]: line.split("\t")[1:] for line in lines}
+    assert set(tasks) < set(found)
+    assert found["mamujoco/Ant-4x2"][:3] == ["4-Agent Ant", "0.2", "0.001"]
+    assert found["--ablation no-injection"] == ["the MARL team never enters the population"]
+    assert "pettingzoo:MODULE.ENV" in found
+    assert len(found) == len(lines)
+
+
+def test_list_at_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(streams, "is_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    race("list")
+    lines = capsys.readouterr().out.splitlines()
+    (ant,) = [line for line in lines if line.startswith("mamujoco/Ant-4x2 ")]
+    assert ant.split()[:5] == ["mamujoco/Ant-4x2", "4-Agent", "Ant", "0.2", "0.001"]
+    assert all(len(line) <= 80 for line in lines)
+    assert [line.split()[0] for line in lines[1 : len(task_ids()) + 1]] == list(task_ids())
 
 
 def test_render_a_battle(
