@@ -79,6 +79,17 @@ def refuse_without_effect(
         raise ConfigError(f"{' '.join(sentences)} Leave out what has no effect.")
 
 
+def idle(
+    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool, reads_parallel: bool
+) -> frozenset[str]:
+    """The names of settings that nothing would read, such as ``learner.policy_delay``.
+
+    Arguments are those of `refuse_without_effect`.
+    """
+    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
+    return frozenset(name for name, _ in _idle(asked, **facts, reads_parallel=reads_parallel))
+
+
 _DEFAULTS: dict[str, Any] = {"facmac": FacmacConfig(), "race": RaceConfig(), "env": EnvConfig()}
 
 

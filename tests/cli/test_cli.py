@@ -184,8 +184,9 @@ def test_ctrl_c_saves_and_says_how_to_go_on(
 
 def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        race("train --help")
+        race("train --help-all")
     text = capsys.readouterr().out
+    assert "None}" not in text
     groups = {
         f.name: f.default_factory()
         for f in dataclasses.fields(Config)  # type: ignore[misc]
@@ -194,6 +195,50 @@ def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     for group, settings in groups.items():
         for setting in dataclasses.fields(settings):
             assert f"--{group}.{setting.name}".replace("_", "-") in text
+
+
+def helped(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        race(command)
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_is_short_at_first(capsys: pytest.CaptureFixture[str]) -> None:
+    text = helped("train --help", capsys)
+    assert len(text.splitlines()) < 60
+    places = [text.index(f"  {flag}") for flag in ("TASK", "--algo", "--env-steps INT", "--base")]
+    assert places == sorted(places)
+    assert "--learner.* " in text
+    assert "--learner.discount" not in text
+    assert "[1_000_000]" in text
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown", "hidden"),
+    [
+        ("mamujoco/Ant-4x2", "learner.policy-delay env.agent-obsk", "facmac.discount env.agents"),
+        ("mamujoco/Ant-4x2 --algo matd3", "learner.discount", "race.population-size"),
+        ("micro/2s3z", "facmac.discount race.elite-copy", "learner.discount env.retries"),
+        ("probe/matching --algo facmac", "facmac.mixer-size", "race.sharing env.kwargs"),
+        ("pettingzoo:mpe2.simple_v3", "env.agents facmac.td-lambda", "learner.tau env.agent-obsk"),
+        ("probe/chain --env-steps x", "learner.discount", "facmac.discount"),
+    ],
+)
+def test_help_of_a_task_shows_what_it_has(
+    asked: str, shown: str, hidden: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = helped(f"train {asked} --help", capsys)
+    assert all(f"  --{name}" in text for name in shown.split())
+    assert not any(f"  --{name}" in text for name in hidden.split())
+    assert f"usage: race train {asked.split()[0]} " in text
+
+
+def test_help_tells_defaults_of_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    text = helped("train probe/chain --preset demo -h", capsys)
+    assert re.search(r"--learner.hidden-sizes INT INT [^-]*\[160 120\]", text)
+    assert "--learner.layer-norm, --learner.no-layer-norm" in text
+    assert "no task 'probe/chian'" in fails("train probe/chian --help", capsys)
 
 
 def test_observations_are_settings(tmp_path: Path) -> None:
