@@ -406,13 +406,15 @@ class DiscreteTask(NamedTuple):
     [N, O], ``state`` [S] and ``avail_actions`` [N, n_actions], and whose action is one number per
     agent, [N]. ``render_mode`` is None or ``"rgb_array"``. ``device()``, where there is one,
     returns the same task for rollouts on the device. ``seeded`` is False where an environment has
-    no place for a seed, so that its episodes do not repeat.
+    no place for a seed, so that its episodes do not repeat. ``facts`` are what else decides what a
+    run means, by name, as plain JSON values; they are kept in ``metadata.json``.
     """
 
     spec: DiscreteSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
     device: Callable[[], DeviceEnv] | None = None
     seeded: bool = True
+    facts: tuple[tuple[str, Any], ...] = ()
 
 
 class Task(NamedTuple):
@@ -421,13 +423,14 @@ class Task(NamedTuple):
     ``make(render_mode)`` returns a `gymnasium.Env` whose observation is the global state, a
     float array of shape [S], and whose action is the joint action, shape [U], in its own units
     (between ``spec.action_low`` and ``spec.action_high``). Time limits are the environment's
-    ``truncated``. ``render_mode`` is None or ``"rgb_array"``. ``seeded`` is False where an
-    environment has no place for a seed, so that its episodes do not repeat.
+    ``truncated``. ``render_mode`` is None or ``"rgb_array"``. ``seeded`` and ``facts`` are as in
+    `DiscreteTask`.
     """
 
     spec: EnvSpec
     make: Callable[[str | None], gymnasium.Env[Any, Any]]
     seeded: bool = True
+    facts: tuple[tuple[str, Any], ...] = ()
 
 
 AnyTask = Task | DiscreteTask

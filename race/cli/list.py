@@ -3,13 +3,17 @@
 import dataclasses
 import json
 from dataclasses import dataclass
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import tyro
 
+from race.cli import streams
 from race.config.ablations import ABLATIONS
 from race.config.presets import PRESETS, TABLES
 from race.config.settings import EVOLUTIONS, Algo
+
+if TYPE_CHECKING:
+    from race.envs import TaskInfo
 
 ALGORITHMS = {
     "race": "RACE: a MARL team and an evolving population over shared encoders (--base matd3, "
@@ -22,13 +26,29 @@ ALGORITHMS = {
     "facmac": "FACMAC: the agents' utilities, mixed; for discrete actions too, recurrent there",
 }
 
+_OF_ONES_OWN = {
+    "micro/PATH.toml": "a map of your own (docs/micro.md)",
+    "pettingzoo:MODULE.ENV": "an environment of PettingZoo's interface (docs/environments.md)",
+    "MODULE:FUNCTION": "a task of your own (docs/environments.md)",
+}
+_EVOLUTIONS = {
+    "ga": "the paper's genetic algorithm",
+    "cem": "cross-entropy method",
+    "es": "evolution strategy",
+    "MODULE:FUNCTION": "your own (docs/evolution.md)",
+}
+_OF_TASKS = ("task", "in the paper", "alpha", "beta", "what it is")
+
 
 @dataclass(frozen=True)
 class List:
-    """Show tasks, algorithms, ablations and presets."""
+    """Show tasks, algorithms, ablations and presets: a line each.
+
+    In a pipe it is plain text with tabs, to be searched and cut: race list | grep Ant.
+    """
 
     json: bool = False
-    """Print one JSON object instead of tables."""
+    """Print one JSON object instead."""
 
 
 def main(arguments: list[str]) -> None:
@@ -38,6 +58,7 @@ def main(arguments: list[str]) -> None:
 
     tasks = describe_tasks()
     assert set(ALGORITHMS) == set(get_args(Algo))
+    assert set(EVOLUTIONS) < set(_EVOLUTIONS)
     if chosen.json:
         listing = {
             "tasks": [
@@ -55,46 +76,51 @@ def main(arguments: list[str]) -> None:
         }
         print(json.dumps(listing, indent=2))
         return
-    from rich.table import Table
+    told = _sections(tasks)
+    if streams.is_terminal():
+        _show(told)
+        return
+    for title, rows in told.items():  # to be searched and cut: a line each, a tab between columns
+        for name, *columns in rows:
+            print("\t".join((name if title == "task" else f"{title} {name}", *columns)))
 
-    from race.cli import streams
 
-    console = streams.console()
-    table = Table("task", "in the paper", "alpha", "beta", "what it is", title="Tasks")
-    table.columns[0].no_wrap = True
-    group = None
+def _sections(tasks: "tuple[TaskInfo, ...]") -> dict[str, list[tuple[str, ...]]]:
+    """What there is, by kind: name, of tasks what the paper says, and what it is."""
+    found: dict[str, list[tuple[str, ...]]] = {"task": []}
     for info in tasks:
-        kind = info.id.partition("/")[0], info.paper_name is not None
-        if kind != group:  # of each kind the paper's tasks first, then the others
-            table.add_section()
-        group = kind
         alpha, beta = TABLES.get(info.id, ("", ""))
-        table.add_row(info.id, info.paper_name or "", str(alpha), str(beta), info.description)
-    console.print(table)
-    console.print("Also your own: package.module:function, see docs/environments.md\n")
-    algorithms = Table("--algo", "what it is", title="Algorithms")
-    for name, what in ALGORITHMS.items():
-        algorithms.add_row(name, what)
-    console.print(algorithms)
-    ablations = Table("--ablation", "what is left of RACE", title="Ablations")
-    for name, ablation in ABLATIONS.items():
-        ablations.add_row(name, ablation.description)
-    console.print(ablations)
-    console.print(
-        f"--race.evolution: {', '.join(EVOLUTIONS)}, or your own: package.module:function, see "
-        "docs/evolution.md\n"
-    )
-    presets = Table("--preset", "settings", title="Presets of the learner")
-    for name, preset in PRESETS.items():
-        presets.add_row(
+        paper = (info.paper_name or "", str(alpha), str(beta))
+        found["task"].append((info.id, *paper, info.description))
+    for form, what in _OF_ONES_OWN.items():
+        found["task"].append((form, "", "", "", what))
+    found["--algo"] = list(ALGORITHMS.items())
+    found["--ablation"] = [(name, ablation.description) for name, ablation in ABLATIONS.items()]
+    found["--race.evolution"] = list(_EVOLUTIONS.items())
+    found["--preset"] = [
+        (
             name,
             f"layers {preset.hidden_sizes}, batch {preset.batch_size}, "
-            f"Adam {preset.actor_learning_rate:g}, {preset.random_steps:,} random steps",
+            f"Adam {preset.actor_learning_rate:g}, {preset.random_steps:,} random steps "
+            "(continuous actions)",
         )
-    console.print(presets)
-    console.print(
-        "Presets are for continuous actions; on discrete ones see race train --help, --facmac."
-    )
+        for name, preset in PRESETS.items()
+    ]
+    return found
+
+
+def _show(told: dict[str, list[tuple[str, ...]]]) -> None:
+    """A table of each kind, a line for each row, whatever the width."""
+    console = streams.console()
+    for title, rows in told.items():
+        head = _OF_TASKS if title == "task" else (title, "what it is")
+        widths = [max(map(len, cells)) for cells in zip(head, *rows, strict=True)]
+        for row in (head, *rows):
+            line = "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))
+            style = "bold" if row is head else ""
+            console.print(line.rstrip(), style=style, no_wrap=True, overflow="ellipsis")
+        console.print()
+    console.print("Lines that are cut off here are whole in a pipe: race list | grep NAME")
 
 
 def _battle_sizes(task_id: str) -> dict[str, int]:

@@ -42,6 +42,14 @@ def console(*, stderr: bool = False, tolerant: bool = False) -> "Console":
     return Console(file=file, stderr=stderr, markup=False, emoji=False, highlight=False)
 
 
+def is_terminal() -> bool:
+    """Whether a person reads standard output at a terminal."""
+    try:
+        return sys.stdout.isatty()
+    except (AttributeError, ValueError):  # it is closed
+        return False
+
+
 @final
 class Tolerant:
     """A stream whose failures are kept: a run's files are what counts, not who reads along.

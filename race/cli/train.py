@@ -36,11 +36,13 @@ class Train:
     One line per evaluation is printed; everything is in DIR/metrics.jsonl. Steps of all teams
     count, and the last generation, one episode of every team, is always finished: a run ends up
     to that much after --env-steps.
+
+    `race train TASK --help` shows the settings that the task has, --help-all every one.
     """
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
-    """The task, such as mamujoco/HalfCheetah-2x3 or micro/2s3z (`race list` shows all), or
-    package.module:function for your own."""
+    """The task, such as mamujoco/HalfCheetah-2x3 or micro/2s3z (`race list` shows all),
+    pettingzoo:MODULE.ENV, or package.module:function for your own."""
     algo: Algo = "race"
     """race, or a baseline: with a population of whole networks (merl, ea) or without one."""
     base: Base | None = None
@@ -81,6 +83,11 @@ class Train:
 
 def main(arguments: list[str]) -> None:
     """Parses the arguments, makes the run directory and trains."""
+    if set(arguments) & {"-h", "--help", "--help-all"}:
+        from race.cli import help as explained
+
+        explained.show(Train, arguments)
+        return
     chosen, file = _parse(arguments), _file_of(arguments)
     asked = Config(
         **{
@@ -123,10 +130,11 @@ def main(arguments: list[str]) -> None:
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """`race.training.asking.tried`, with a word on what takes the time."""
     from race.cli import streams
+    from race.envs import pettingzoo
     from race.envs.own import is_own
     from race.training import asking
 
-    if not is_own(task_id):
+    if not is_own(task_id) and not task_id.startswith(pettingzoo.PREFIX):
         return asking.tried(task_id, task)
     with streams.console(stderr=True).status("trying the environment"):
         return asking.tried(task_id, task)

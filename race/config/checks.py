@@ -1,5 +1,6 @@
 """What values of a configuration can work."""
 
+import json
 import math
 from collections.abc import Iterable
 from typing import Any
@@ -23,6 +24,8 @@ MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
 MOST_KEPT = 1000
 """Best teams of a run."""
+MOST_OBSERVED = 2**20
+"""Entries of what an agent observes: networks are dense."""
 MOST_JOINTS = 1000
 """Joints between an agent and what it observes: no robot has as many."""
 
@@ -244,7 +247,44 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
             env.step_seconds,
             "left out with --env.processes False: only a process of its own can be ended",
         ),
+        (
+            _is_object(env.kwargs),
+            "env.kwargs",
+            env.kwargs,
+            """a JSON object, such as '{"N": 4}' with the shell's quotes around it""",
+        ),
+        (
+            all(part.strip() for part in env.agents.split(",")),
+            "env.agents",
+            env.agents or "empty",
+            "patterns of agents' names, such as 'adversary_*' or 'agent_0,agent_1'",
+        ),
+        (
+            env.others == "random" or env.others.count(":") == 1,
+            "env.others",
+            env.others or "empty",
+            "random, or package.module:function",
+        ),
+        (
+            env.episode_limit is None or 1 <= env.episode_limit <= MOST_TRANSITIONS,
+            "env.episode-limit",
+            env.episode_limit,
+            "at least 1, or None for the environment's own",
+        ),
+        (
+            1 <= env.largest_observation <= MOST_OBSERVED,
+            "env.largest-observation",
+            env.largest_observation,
+            f"1 to {MOST_OBSERVED}",
+        ),
     ]
+
+
+def _is_object(text: str) -> bool:
+    try:
+        return isinstance(json.loads(text), dict)
+    except ValueError:
+        return False
 
 
 def _start_rules(group: str, settings: LearnerConfig | FacmacConfig) -> list[Rule]:

@@ -17,6 +17,10 @@ NETWORKS = {
 _MATD3_ALONE = ("policy_delay", "smoothing_noise", "smoothing_clip")
 _MIXER = ("mixer_size", "hypernet_size")
 _OBSERVATION = ("agent_obsk", "local_categories", "global_categories")
+_PARALLEL = (
+    *("kwargs", "agents", "others", "team_reward", "state", "episode_limit"),
+    "largest_observation",
+)
 _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
@@ -40,6 +44,7 @@ def refuse_without_effect(
     discrete: bool,
     reads_env: bool,
     on_host: bool,
+    reads_parallel: bool = False,
 ) -> None:
     """Refuses settings that nothing would read.
 
@@ -49,12 +54,18 @@ def refuse_without_effect(
         discrete: whether the task's actions are.
         reads_env: whether the task reads what its agents observe.
         on_host: whether its environments run on the host.
+        reads_parallel: whether the task reads who the team of a PettingZoo environment is.
 
     Raises:
         ConfigError: naming the settings, and why they would have no effect.
     """
     told: dict[str, list[str]] = {}
-    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
+    facts = {
+        "discrete": discrete,
+        "reads_env": reads_env,
+        "on_host": on_host,
+        "reads_parallel": reads_parallel,
+    }
     for name, why in without_effect(asked, defaults, **facts).items():
         told.setdefault(why, []).append(f"--{name.replace('_', '-')}")
     if told:
@@ -65,11 +76,18 @@ def refuse_without_effect(
 
 
 def without_effect(
-    asked: Config, defaults: LearnerConfig, *, discrete: bool, reads_env: bool, on_host: bool
+    asked: Config,
+    defaults: LearnerConfig,
+    *,
+    discrete: bool,
+    reads_env: bool,
+    on_host: bool,
+    reads_parallel: bool = False,
 ) -> dict[str, str]:
     """The settings that are not what they usually are, though nothing would read them; and why."""
     found: dict[str, str] = {}
-    for name, why in _idle(asked, discrete=discrete, reads_env=reads_env, on_host=on_host):
+    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
+    for name, why in _idle(asked, **facts, reads_parallel=reads_parallel):
         if name not in found and setting(asked, name) != usual(name, defaults):
             found[name] = why
     return found
@@ -87,6 +105,17 @@ def usual(name: str, defaults: LearnerConfig) -> Any:
     return getattr(defaults if group == "learner" else _DEFAULTS[group], field)
 
 
+def idle(
+    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool, reads_parallel: bool
+) -> frozenset[str]:
+    """The names of settings that nothing would read, such as ``learner.policy_delay``.
+
+    Arguments are those of `refuse_without_effect`.
+    """
+    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
+    return frozenset(name for name, _ in _idle(asked, **facts, reads_parallel=reads_parallel))
+
+
 _DEFAULTS: dict[str, Any] = {
     "": Config(""),
     "facmac": FacmacConfig(),
@@ -96,7 +125,7 @@ _DEFAULTS: dict[str, Any] = {
 
 
 def _idle(
-    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool
+    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool, reads_parallel: bool
 ) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
     yield from _idle_of_population(asked)
@@ -107,6 +136,9 @@ def _idle(
     elif asked.env.library_observation:
         why = "with --env.library-observation, which chooses for itself"
         yield from ((f"env.{name}", why) for name in _OBSERVATION)
+    if not reads_parallel:
+        why = f"on {asked.task}, which is no PettingZoo task"
+        yield from ((f"env.{name}", why) for name in _PARALLEL)
     if not on_host:
         why = f"on {asked.task}, which runs in one compiled program"
         yield from ((f"env.{name}", why) for name in _HOST)

@@ -24,6 +24,8 @@ Selection = Literal["team", "agent"]
 TeamDraw = Literal["once", "each"]
 EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
+TeamReward = Literal["mean", "sum"]
+StateSource = Literal["auto", "environment", "observations"]
 
 
 @dataclass(frozen=True)
@@ -231,7 +233,7 @@ Categories = Annotated[
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """What an agent of a Multi-Agent MuJoCo task observes, and where environments run."""
+    """What Multi-Agent MuJoCo shows, who is a team of PettingZoo's, where environments run."""
 
     agent_obsk: int = 0
     """Observe joints up to this distance; 0 is the agent's own joints only (Section 4.1)."""
@@ -242,6 +244,24 @@ class EnvConfig:
     """What is observed of the torso."""
     library_observation: bool = False
     """Use gymnasium-robotics' own default observation instead of the three settings above."""
+    kwargs: str = "{}"
+    """Arguments of the PettingZoo environment, as a JSON object, such as '{"N": 4}'."""
+    agents: str = "*"
+    """Its agents that are the team: patterns such as 'adversary_*', with commas in between."""
+    others: str = "random"
+    """What its other agents do: random, or package.module:function, which is called with (agent,
+    observation, action space, numpy generator) and returns an action."""
+    team_reward: TeamReward = "mean"
+    """What the team is paid: the mean or the sum of its agents' rewards. An agent that is not there
+    gets 0."""
+    state: StateSource = "auto"
+    """The global state: the environment's own (its state()), or the observations of all agents.
+    auto: its own, if there is one and it is not too large."""
+    episode_limit: int | None = None
+    """Steps after which an episode is cut off (truncated). None: what the environment calls
+    max_cycles."""
+    largest_observation: int = 4096
+    """Most entries of what an agent observes, and of the environment's own state."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
     enough cores), and where steps have a time limit."""
@@ -385,6 +405,13 @@ _BEFORE: dict[str, Any] = {
     "compute": ComputeConfig(),
     "keep_best": 0,
     "init_from": None,
+    "kwargs": "{}",
+    "agents": "*",
+    "others": "random",
+    "team_reward": "mean",
+    "state": "auto",
+    "episode_limit": None,
+    "largest_observation": 4096,
 }
 
 

@@ -1,4 +1,4 @@
-"""Tasks: Multi-Agent MuJoCo, micromanagement battles, probes with known answers, and your own.
+"""Tasks: Multi-Agent MuJoCo, battles, PettingZoo, probes with known answers, and your own.
 
 A family of tasks may be added or changed here; whoever trains sees `race.types.AnyTask` alone.
 """
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from race.config.checks import check_env
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
-from race.envs import discrete_probe, mamujoco, own, probe
+from race.envs import discrete_probe, mamujoco, own, pettingzoo, probe
 from race.envs.own import factorised
 from race.errors import TaskError
 from race.types import AnyTask, DiscreteTask, Task
@@ -24,6 +24,7 @@ __all__ = [
     "make_discrete_task",
     "make_task",
     "reads_config",
+    "reads_team",
     "task_ids",
 ]
 
@@ -102,8 +103,10 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
         task_id: one of `task_ids`; any ``mamujoco/<Scenario>-<partition>`` that
             gymnasium-robotics knows; or your own as ``package.module:function``, where the
             function, called without arguments (or with `config`, if it takes one), returns a
-            `Task` or a `DiscreteTask`. The module is also looked for in the current directory.
-        config: what agents of Multi-Agent MuJoCo observe; its defaults, if not given.
+            `Task` or a `DiscreteTask`; or ``pettingzoo:MODULE.ENV``. Modules are also looked for in
+            the current directory.
+        config: what agents of Multi-Agent MuJoCo observe, and who is the team of a PettingZoo
+            environment; its defaults, if not given.
 
     Raises:
         TaskError: if there is no such task; the message names the nearest ones.
@@ -112,6 +115,8 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
     check_env(config)
     if task_id.startswith(_MICRO):
         return make_discrete_task(task_id)
+    if task_id.startswith(pettingzoo.PREFIX):
+        return pettingzoo.make_task(task_id, config)
     if own.is_own(task_id):
         return own.own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
@@ -165,6 +170,13 @@ def make_discrete_task(task_id: str) -> DiscreteTask:
 
 def reads_config(task_id: str) -> bool:
     """Whether a task that there is reads what agents observe from an `EnvConfig`."""
-    if own.is_own(task_id):
-        return own.takes_config(own.own_function(task_id))
-    return task_id.startswith("mamujoco/")
+    return task_id.startswith("mamujoco/") or _own_reads_config(task_id)
+
+
+def reads_team(task_id: str) -> bool:
+    """Whether a task that there is reads who is the team of a PettingZoo environment."""
+    return task_id.startswith(pettingzoo.PREFIX) or _own_reads_config(task_id)
+
+
+def _own_reads_config(task_id: str) -> bool:
+    return own.is_own(task_id) and own.takes_config(own.own_function(task_id))

@@ -92,6 +92,8 @@ def mask(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.bool_]:
     Raises:
         HandedOverError: if it is something else than bools, zeros and ones.
     """
+    if isinstance(value, np.ndarray) and value.dtype == np.bool_ and value.shape == shape:
+        return value.copy()
     array = _array(value, shape, name)
     if not ((array == 0) | (array == 1)).all():
         strange = array[(array != 0) & (array != 1)].flat[0]
@@ -101,17 +103,24 @@ def mask(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.bool_]:
     return array.astype(np.bool_)
 
 
-def truth(value: Any, name: str) -> bool:
+def truth(value: Any, name: str, agent: str | None = None) -> bool:
     """A yes or no: a bool, a 0 or 1, or an array of one of these.
 
+    Args:
+        value: what came.
+        name: what it is, for the message.
+        agent: whose alone it is; None: the team's.
+
     Raises:
-        HandedOverError: for anything else, such as one value per agent.
+        HandedOverError: for anything else, such as one value per agent where it is the team's.
     """
     if value is True or value is False:
         return value
     one = _single(value)
     if one in (0, 1):
         return bool(one)
+    if agent is not None:
+        raise HandedOverError(f"{name} of {agent} is {came(value)}, but must be True or False")
     advice = ": the same as all() or any() of the agents, where each has its own"
     if one is not None or isinstance(value, str):
         advice = ", and no number or text"
@@ -120,21 +129,26 @@ def truth(value: Any, name: str) -> bool:
     )
 
 
-def payment(value: Any) -> float:
+def payment(value: Any, agent: str | None = None) -> float:
     """A reward: a number, or an array of one.
+
+    Args:
+        value: what came.
+        agent: whose alone it is; None: the team's.
 
     Raises:
         HandedOverError: for anything else, and for what is not finite or larger than `LARGEST`.
     """
     one = float(value) if isinstance(value, float) else _single(value)
+    if one is not None and abs(one) <= LARGEST:
+        return one
+    name = "the reward" if agent is None else f"the reward of {agent}"
     if one is None:
-        raise HandedOverError(
-            f"the reward is {came(value)}, but must be one number for the whole team. Add up what "
-            "the agents get, if it is one for each"
-        )
-    if not abs(one) <= LARGEST:
-        raise HandedOverError(f"the reward is {one}. {_too_large(one)}")
-    return one
+        must = "one number"
+        if agent is None:
+            must += " for the whole team. Add up what the agents get, if it is one for each"
+        raise HandedOverError(f"{name} is {came(value)}, but must be {must}")
+    raise HandedOverError(f"{name} is {one}. {_too_large(one)}")
 
 
 def state(spec: EnvSpec, observation: Any) -> Float32[np.ndarray, "S"]:
@@ -152,7 +166,9 @@ def moment(spec: DiscreteSpec, observation: Any) -> Observation:
     Raises:
         HandedOverError: if it is not what the task says, or leaves an agent no action.
     """
-    if not isinstance(observation, Mapping) or not set(Observation._fields) <= set(observation):
+    if not isinstance(observation, dict | Mapping) or not all(
+        name in observation for name in Observation._fields
+    ):
         raise HandedOverError(
             f"the observation is {came(observation)}, but must be a dictionary of obs "
             f"[{spec.n_agents}, {spec.obs_size}], state [{spec.state_size}] and avail_actions "
@@ -175,11 +191,11 @@ def refuse_idle(avail_actions: Bool[np.ndarray, "N A"]) -> None:
     Raises:
         HandedOverError: if one has none.
     """
-    idle = np.flatnonzero(~avail_actions.any(axis=1))
-    if len(idle):
+    offered = avail_actions.any(axis=1)
+    if not offered.all():
         raise HandedOverError(
-            f"no action is available to agent {idle[0]}. Give every agent one that does nothing, "
-            "also when it is dead and after the last step"
+            f"no action is available to agent {offered.argmin()}. Give every agent one that does "
+            "nothing, also when it is dead and after the last step"
         )
 
 

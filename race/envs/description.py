@@ -12,7 +12,7 @@ from race.types import AnyTask, DiscreteTask
 def describe(task: AnyTask) -> dict[str, Any]:
     """Who sees what and moves what."""
     if isinstance(task, DiscreteTask):
-        return dataclasses.asdict(task.spec)
+        return dataclasses.asdict(task.spec) | dict(task.facts)
     spec = task.spec
     return {
         "task": spec.task,
@@ -23,7 +23,7 @@ def describe(task: AnyTask) -> dict[str, Any]:
         "episode_limit": spec.episode_limit,
         "obs_index": spec.obs_index,
         "action_index": spec.action_index,
-    }
+    } | dict(task.facts)
 
 
 def refuse_changed(recorded: Mapping[str, Any], task: AnyTask) -> None:

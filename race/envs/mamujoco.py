@@ -73,7 +73,7 @@ def make_task(task_id: str, config: EnvConfig) -> Task:
     scenario, partition = _parse(task_id)
     name = f"mamujoco/{scenario}-{partition.replace('|', 'x')}"
     make = functools.partial(_make, scenario, partition, config)
-    with _quiet():
+    with quiet():
         try:
             env = _single_agent_env(scenario, partition, None)
         except Exception as error:
@@ -122,7 +122,7 @@ def _parse(task_id: str) -> tuple[str, str]:
 
 
 def _library_knows(scenario: str, partition: str) -> bool:
-    with _quiet():
+    with quiet():
         from gymnasium_robotics.envs.multiagent_mujoco.obsk import get_parts_and_edges
     try:
         get_parts_and_edges(scenario, partition)
@@ -140,7 +140,7 @@ def _make(
     *,
     augmented: bool = False,
 ) -> gymnasium.Env[Any, Any]:
-    with _quiet():
+    with quiet():
         env = _single_agent_env(scenario, partition, render_mode)
         if augmented:
             return _ReferenceState(env, _reference(env, scenario, partition, config))
@@ -305,7 +305,7 @@ def _spec(
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Loads the library and keeps back what third parties say of it that is known as harmless."""
     with blamed(TaskError, "mujoco cannot be imported, which Multi-Agent MuJoCo runs on"):
         import mujoco

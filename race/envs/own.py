@@ -19,7 +19,7 @@ from race.types import AnyTask, DiscreteTask, EnvSpec, Name, Task, Whole
 
 def is_own(task_id: str) -> bool:
     """Whether an id names a function of a module of the user's."""
-    return re.fullmatch(r"[\w.]+:\w+", task_id) is not None
+    return re.fullmatch(r"(?!pettingzoo:)[\w.]+:\w+", task_id) is not None
 
 
 def own_function(task_id: str) -> Callable[..., Any]:
@@ -86,9 +86,11 @@ def factorised(
         action_index: for each agent, the entries of the joint action it moves; every entry must
             belong to exactly one agent.
         task: the name of the task.
-        episode_limit: steps after which the environment truncates an episode. None: the limit
-            that the environment was registered with. This describes the environment's own limit
-            and imposes none.
+        episode_limit: steps after which an episode ends at the latest. None: the limit that the
+            environment was registered with. Training, tests and evaluation cut an episode off
+            there (it is truncated, and bootstraps) if the environment has not ended it before;
+            one that ends its episodes itself should do so at the same step, by `truncated`. The
+            environment that ``make`` returns is not changed: stepped by hand, it goes on.
 
     Raises:
         TaskError: if spaces are not flat boxes, actions are unbounded, no limit is known, or the

@@ -10,7 +10,7 @@ from race.config.effects import refuse_without_effect, setting, usual, without_e
 from race.config.files import Wanted, with_settings
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config
-from race.envs import reads_config
+from race.envs import pettingzoo, reads_config, reads_team
 from race.envs.own import is_own
 from race.envs.trial import try_out
 from race.errors import ConfigError, say
@@ -91,6 +91,7 @@ def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
         "discrete": isinstance(task, DiscreteTask),
         "reads_env": reads_config(asked.task),
         "on_host": not isinstance(task, DiscreteTask) or task.device is None,
+        "reads_parallel": reads_team(asked.task),
     }
 
 
@@ -100,12 +101,16 @@ def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     Raises:
         TaskError: if it fails, or breaks the contract.
     """
-    if not is_own(task_id):
+    foreign = task_id.startswith(pettingzoo.PREFIX)
+    if not is_own(task_id) and not foreign:
         return {"repeats": True}
     trial = try_out(task)
     if trial.note:
         say(trial.note)
-    return {"repeats": trial.repeats}
+    found: dict[str, Any] = {"repeats": trial.repeats, "conflict": trial.conflict}
+    if foreign:
+        found["packages"] = pettingzoo.packages(task_id.removeprefix(pettingzoo.PREFIX))
+    return found
 
 
 def name_of(config: Config) -> str:

@@ -15,8 +15,9 @@ import pytest
 from commands import alone, fails, race
 from PIL import Image
 
-from race.cli import COMMANDS
+from race.cli import COMMANDS, streams
 from race.config.settings import Config
+from race.envs import task_ids
 from race.runs import checkpoints, metrics
 from race.runs import directory as run_directory
 from race.viewing.progress import TrainingDisplay
@@ -183,8 +184,9 @@ def test_ctrl_c_saves_and_says_how_to_go_on(
 
 def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        race("train --help")
+        race("train --help-all")
     text = capsys.readouterr().out
+    assert "None}" not in text
     groups = {
         f.name: f.default_factory()
         for f in dataclasses.fields(Config)  # type: ignore[misc]
@@ -193,6 +195,50 @@ def test_every_setting_is_an_option(capsys: pytest.CaptureFixture[str]) -> None:
     for group, settings in groups.items():
         for setting in dataclasses.fields(settings):
             assert f"--{group}.{setting.name}".replace("_", "-") in text
+
+
+def helped(command: str, capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stopped:
+        race(command)
+    assert stopped.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_help_is_short_at_first(capsys: pytest.CaptureFixture[str]) -> None:
+    text = helped("train --help", capsys)
+    assert len(text.splitlines()) < 60
+    places = [text.index(f"  {flag}") for flag in ("TASK", "--algo", "--env-steps INT", "--base")]
+    assert places == sorted(places)
+    assert "--learner.* " in text
+    assert "--learner.discount" not in text
+    assert "[1_000_000]" in text
+
+
+@pytest.mark.parametrize(
+    ("asked", "shown", "hidden"),
+    [
+        ("mamujoco/Ant-4x2", "learner.policy-delay env.agent-obsk", "facmac.discount env.agents"),
+        ("mamujoco/Ant-4x2 --algo matd3", "learner.discount", "race.population-size"),
+        ("micro/2s3z", "facmac.discount race.elite-copy", "learner.discount env.retries"),
+        ("probe/matching --algo facmac", "facmac.mixer-size", "race.sharing env.kwargs"),
+        ("pettingzoo:mpe2.simple_v3", "env.agents facmac.td-lambda", "learner.tau env.agent-obsk"),
+        ("probe/chain --env-steps x", "learner.discount", "facmac.discount"),
+    ],
+)
+def test_help_of_a_task_shows_what_it_has(
+    asked: str, shown: str, hidden: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = helped(f"train {asked} --help", capsys)
+    assert all(f"  --{name}" in text for name in shown.split())
+    assert not any(f"  --{name}" in text for name in hidden.split())
+    assert f"usage: race train {asked.split()[0]} " in text
+
+
+def test_help_tells_defaults_of_the_preset(capsys: pytest.CaptureFixture[str]) -> None:
+    text = helped("train probe/chain --preset demo -h", capsys)
+    assert re.search(r"--learner.hidden-sizes INT INT [^-]*\[160 120\]", text)
+    assert "--learner.layer-norm, --learner.no-layer-norm" in text
+    assert "no task 'probe/chian'" in fails("train probe/chian --help", capsys)
 
 
 def test_observations_are_settings(tmp_path: Path) -> None:
@@ -215,9 +261,26 @@ def test_list(capsys: pytest.CaptureFixture[str]) -> None:
     assert set(listing["algorithms"]) == {"race", "merl", "ea", "matd3", "maddpg", "facmac"}
     assert "vmm-only" in listing["ablations"]
     race("list")
-    table = capsys.readouterr().out
-    assert "mamujoco/HumanoidStandup-9x8" in table
-    assert "micro/so_many_baneling" in table
+    lines = capsys.readouterr().out.splitlines()  # nobody reads at a terminal
+    found = {line.split("\t")[0]: line.split("\t")[1:] for line in lines}
+    assert set(tasks) < set(found)
+    assert found["mamujoco/Ant-4x2"][:3] == ["4-Agent Ant", "0.2", "0.001"]
+    assert found["--ablation no-injection"] == ["the MARL team never enters the population"]
+    assert "pettingzoo:MODULE.ENV" in found
+    assert len(found) == len(lines)
+
+
+def test_list_at_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(streams, "is_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    race("list")
+    lines = capsys.readouterr().out.splitlines()
+    (ant,) = [line for line in lines if line.startswith("mamujoco/Ant-4x2 ")]
+    assert ant.split()[:5] == ["mamujoco/Ant-4x2", "4-Agent", "Ant", "0.2", "0.001"]
+    assert all(len(line) <= 80 for line in lines)
+    assert [line.split()[0] for line in lines[1 : len(task_ids()) + 1]] == list(task_ids())
 
 
 def test_render_a_battle(

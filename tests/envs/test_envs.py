@@ -89,7 +89,7 @@ def test_the_documents_example_works(directory):
 
 
 def test_the_documents_discrete_example_works(directory):
-    _, example, _ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
+    _, example, *_ = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
     write(directory, "my_battle.py", example)
     task = make_task("my_battle:task")
     assert isinstance(task, DiscreteTask)
