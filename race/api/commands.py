@@ -16,7 +16,7 @@ from race.teams.evaluation import evaluate as play
 from race.teams.export import Exported, format_of
 from race.teams.export import export as write
 from race.teams.formats import Format
-from race.teams.heirloom import heirloom_of
+from race.teams.initial import initial_teams
 from race.teams.team import Team
 from race.teams.trained import Trained, load_trained
 from race.training.asking import settled_with_file, tried, usual_directory
@@ -82,9 +82,9 @@ def train(
     )
     path = usual_directory(resolved) if run_dir is None else Path(run_dir)
     run_directory.refuse_occupied(path)
-    begins_with = heirloom_of(resolved, made)
+    begins_with = initial_teams(resolved, made)
     run_directory.create(path, resolved, describe(made) | tried(resolved.task, made))
-    begins_with.hand_to(path)
+    begins_with.keep_in(path)
     train_in(path, resolved, on_row, progress)
     return Run(path)
 
@@ -133,6 +133,9 @@ def render(
         seed: of the episode.
         seconds: simulated time to show; 0 for the whole episode. None: 15, the whole of a battle.
 
+    MuJoCo is drawn with OpenGL, if there is one, where nothing had imported it before; else set
+    ``MUJOCO_GL`` (such as ``egl``) before Python starts, or the slower built-in renderer draws.
+
     Raises:
         RaceError: if it cannot be played, drawn or written.
     """
@@ -141,6 +144,8 @@ def render(
     check_seed(seed)
     from race.viewing import filming  # it takes a while to import
 
+    if not run_directory.open_run(_directory(what)).discrete:
+        filming.choose_renderer()  # mujoco reads what is chosen here when it is imported
     trained, name = _which(what, team)
     drawn = filming.film(trained, name, seed, seconds, path)
     frames = filming.write(drawn, path)
@@ -172,6 +177,12 @@ def export(
     kind = format_of(path, format)
     trained, name = _which(what, team)
     return write(Team(trained, trained.resolve(name)), path, kind, per_agent=per_agent)
+
+
+def _directory(what: Run | Team | Directory) -> Path:
+    if isinstance(what, Team):
+        return what.run_dir
+    return what.path if isinstance(what, Run) else Path(what)
 
 
 def _which(what: Run | Team | Directory, team: str) -> tuple[Trained, str]:
