@@ -18,7 +18,7 @@ from race.teams.export import export as write
 from race.teams.formats import Format
 from race.teams.initial import initial_teams
 from race.teams.team import Team
-from race.teams.trained import Trained, load_trained
+from race.teams.trained import Trained
 from race.training.asking import settled_with_file, tried, usual_directory
 from race.viewing.wanted import check_seed, check_video
 
@@ -187,6 +187,7 @@ def _directory(what: Run | Team | Directory) -> Path:
 
 def _which(what: Run | Team | Directory, team: str) -> tuple[Trained, str]:
     if isinstance(what, Team):
+        use_cache(what.trained.config.compute)
         return what.trained, what.name
     run = what if isinstance(what, Run) else Run(what)
     use_cache(run.config.compute)
