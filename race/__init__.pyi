@@ -1,11 +1,11 @@
-from race.api import Rows as Rows
-from race.api import Run as Run
-from race.api import Team as Team
-from race.api import evaluate as evaluate
-from race.api import export as export
-from race.api import load as load
-from race.api import render as render
-from race.api import train as train
+from race.api.commands import evaluate as evaluate
+from race.api.commands import export as export
+from race.api.commands import render as render
+from race.api.commands import train as train
+from race.api.run import Rows as Rows
+from race.api.run import Run as Run
+from race.api.run import load as load
+from race.teams.team import Team as Team
 
 __version__: str
 ALGORITHM_VERSION: int

@@ -54,7 +54,7 @@ def test_what_is_slow_to_import_is_imported_when_asked_for() -> None:
 def test_the_stub_names_what_there_is() -> None:
     stub = (Path(race.__file__).parent / "__init__.pyi").read_text()
     names = {line.split(" as ")[1] for line in stub.splitlines() if " as " in line}
-    assert names == set(race._OF_API)  # type: ignore[attr-defined]
+    assert names == set(race._WHERE)  # type: ignore[attr-defined]
     assert all(getattr(race, name) is not None for name in names)
 
 

@@ -104,7 +104,7 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
-    from race.teams.heirloom import heirloom_of
+    from race.teams.initial import initial_teams
     from race.training.asking import name_of, settled_with_file, usual_directory
 
     if chosen.seeds is not None:  # this process only watches
@@ -117,9 +117,9 @@ def main(arguments: list[str]) -> None:
         refuse_for_one_run(chosen.jobs, chosen.cohort, "without --seeds. Leave it out.")
         path = chosen.run_dir or usual_directory(config)
         run_directory.refuse_occupied(path)
-        begins_with = heirloom_of(config, task)
+        begins_with = initial_teams(config, task)
         run_directory.create(path, config, describe(task) | tried(asked.task, task))
-        begins_with.hand_to(path)
+        begins_with.keep_in(path)
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
@@ -146,7 +146,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     from race.config.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
-    from race.teams.heirloom import heirloom_of
+    from race.teams.initial import initial_teams
 
     seeds = parse_seeds(str(chosen.seeds))
     if chosen.seed != file.settings.get("seed", 1):
@@ -161,11 +161,11 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
                 f"`{command('race', 'resume', path)}`, or choose another directory with "
                 "`--run-dir`."
             )
-    begins_with = heirloom_of(config, task)
+    begins_with = initial_teams(config, task)
     described = describe(task) | tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
-        begins_with.hand_to(place)
+        begins_with.keep_in(place)
 
 
 def _parse(arguments: list[str]) -> Train:

@@ -113,9 +113,11 @@ def of_mapping(description: Mapping[str, Any]) -> Wanted:
     preset, ablation = description.get("preset", "paper"), description.get("ablation", ())
     if preset not in get_args(Preset):
         raise ConfigError(f"There is no preset {preset!r}; there are {', '.join(PRESETS)}.")
+    if not isinstance(ablation, str | list | tuple):
+        raise ConfigError(f"ablation is {ablation!r}, but must be a name or several.")
     ablation = (ablation,) if isinstance(ablation, str) else tuple(ablation)
     for name in ablation:
-        if name not in ABLATIONS:
+        if name not in tuple(ABLATIONS):
             raise ConfigError(f"There is no ablation {name!r}; there are {', '.join(ABLATIONS)}.")
     return Wanted(settings, preset, ablation)
 

@@ -166,7 +166,7 @@ def _painter(
     inner = getattr(env.env, "unwrapped", env.env)
     model, data = (getattr(inner, name, None) for name in ("model", "data"))
     if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
-        if renderer.backend != "sketch":
+        if _taken_up(renderer.backend):
             with contextlib.suppress(Exception):  # mujoco took up another backend, or none
                 scene = _opengl(model, data)
                 return env, lambda caption: sketch.with_caption(scene(), caption)
@@ -181,6 +181,14 @@ def _painter(
         )
     drawn = CheckedEnv(task, render_mode="rgb_array")
     return drawn, lambda caption: sketch.with_caption(drawn.render(), caption)
+
+
+def _taken_up(backend: Backend) -> bool:
+    """Whether mujoco draws with that: it decides once, when it is imported."""
+    import mujoco
+
+    context = getattr(mujoco, "GLContext", None)
+    return context is not None and context.__module__ == f"mujoco.{backend}"
 
 
 def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:

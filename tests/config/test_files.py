@@ -70,6 +70,8 @@ def test_groups_may_be_dataclasses() -> None:
         ('algo = "rase"', "it is one of 'race', 'merl'"),
         ('preset = "x"', "There is no preset"),
         ('ablation = "x"', "There is no ablation"),
+        ("ablation = 3", "must be a name"),
+        ("ablation = [[]]", "There is no ablation"),
         ("seeds = [1, 2]", "race sweep"),
         ("learner = 3", "must be a table"),
     ],

@@ -10,13 +10,13 @@ from race.training.inheriting import made_to_fit, store
 from race.types import AnyTask
 
 
-class Heirloom(NamedTuple):
+class InitialTeams(NamedTuple):
     """The teams that a run begins with; None: random ones."""
 
     teams: Inherited | None
     told: dict[str, Any]
 
-    def hand_to(self, path: Path) -> None:
+    def keep_in(self, path: Path) -> None:
         """Keeps them in a run directory that has just been made.
 
         Raises:
@@ -26,7 +26,7 @@ class Heirloom(NamedTuple):
             store(path, self.teams, self.told)
 
 
-def heirloom_of(config: Config, task: AnyTask) -> Heirloom:
+def initial_teams(config: Config, task: AnyTask) -> InitialTeams:
     """What ``init_from`` of a configuration names, made to fit.
 
     Raises:
@@ -34,7 +34,7 @@ def heirloom_of(config: Config, task: AnyTask) -> Heirloom:
         RunDirectoryError: if there is no such run, or it has no checkpoint yet.
     """
     if config.init_from is None:
-        return Heirloom(None, {})
+        return InitialTeams(None, {})
     source = load_trained(config.init_from)
     teams = made_to_fit(
         source.encoders, source.heads, source.config, source.path, config, task.spec
@@ -45,4 +45,4 @@ def heirloom_of(config: Config, task: AnyTask) -> Heirloom:
         "from_task": source.config.task,
         "from_env_steps": source.progress.env_steps,
     }
-    return Heirloom(teams, told)
+    return InitialTeams(teams, told)
