@@ -148,6 +148,7 @@ def train_in(
     from race.training.interrupts import Interrupts
     from race.training.run_state import Progress
     from race.training.trainer import is_over, train
+    from race.viewing.logged import logged
     from race.viewing.progress import TrainingDisplay
 
     use_cache(config.compute)
@@ -169,7 +170,8 @@ def train_in(
             if stopped:
                 interrupts.stop()
 
-        made = train(path, config, extend=extend, report=report, interrupts=interrupts)
+        with logged(path, config, report) as told:
+            made = train(path, config, extend=extend, report=told, interrupts=interrupts)
     if failures:
         raise failures[0]
     if not is_over(config, made) and not stopped:

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from race.config.cohort import CohortConfig
+from race.config.loggers import LoggerName
 from race.errors import ConfigError, RunDirectoryError, command
 
 
@@ -40,6 +41,8 @@ class Sweep:
     """Say what would be run, and run nothing."""
     jobs: int | None = None
     """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    log: tuple[LoggerName, ...] = ()
+    """Programs that new runs tell every row besides (`race train --help`)."""
     cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
@@ -56,9 +59,9 @@ def main(arguments: list[str]) -> None:
     runs = _planned(_read(chosen.file))
     path = chosen.run_dir or Path("runs") / chosen.file.stem
     if chosen.dry_run:
-        _show(path, runs, chosen)
+        show_plan(path, runs, chosen.cohort)
         return
-    _create(path, runs)
+    create_runs(path, runs, chosen.log)
     run_all(path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort)
 
 
@@ -109,13 +112,15 @@ def _name(config: Any, varied: dict[str, Any]) -> str:
     return re.sub(r"[^\w.=+-]+", "_", plain).strip("_")
 
 
-def _create(path: Path, runs: dict[str, Any]) -> None:
+def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> None:
     """Makes the run directories that are not there, or none if one that is there is another."""
     from race.cli.train import tried
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.runs.loggers.sending import choose, refuse_missing
 
+    refuse_missing(log)
     missing = {}
     for name, config in runs.items():
         if not (path / name / "config.json").exists():
@@ -133,9 +138,11 @@ def _create(path: Path, runs: dict[str, Any]) -> None:
             task = make_task(*key)
             described[key] = describe(task) | tried(config.task, task)
         run_directory.create(path / name, config, described[key])
+        choose(path / name, log)
 
 
-def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:
+def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
+    """Lists runs, the process of each, and the memory of its replay buffer."""
     from race.cli import streams
     from race.cli.fleet import accelerators, crews
     from race.cli.worker import Watched
@@ -143,7 +150,7 @@ def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:
 
     console = streams.console()
     watched = [Watched(path / name, config) for name, config in runs.items()]
-    groups = crews(watched, chosen.cohort.batching, chosen.cohort.width, accelerators())
+    groups = crews(watched, cohort.batching, cohort.width, accelerators())
     longest = max(map(len, runs))
     console.print(f"{'run':<{longest}}  process       steps   replay  state", soft_wrap=True)
     sizes: dict[Any, int] = {}
