@@ -13,7 +13,7 @@ import jax
 from race.config.cohort import Batching
 from race.config.settings import Config
 from race.config.shape import shape_of
-from race.errors import DivergenceError
+from race.errors import DivergenceError, RunDirectoryError
 from race.training.generation import evolve, inject, noted, owed, test, to_play
 from race.training.learning import learn, learn_together
 from race.training.run import Run
@@ -34,6 +34,10 @@ def kind_of(config: Config) -> tuple[Any, ...]:
     )
 
 
+Outcome = RunState | DivergenceError | RunDirectoryError
+"""What became of a run in a piece: its state, or what ended it."""
+
+
 class _Piece(IntEnum):
     """What a run does next; the first that any run has come to is done first."""
 
@@ -52,7 +56,7 @@ def together(batching: Batching, count: int) -> bool:
 
 def advance(
     runs: Sequence[Run], states: Sequence[RunState], active: Sequence[bool], *, as_one: bool
-) -> list[RunState | DivergenceError]:
+) -> list[Outcome]:
     """The next piece of a generation: its beginning, some gradient steps, its end, or a test.
 
     Between any two pieces runs can be saved and resumed. Comments name the lines of Algorithm 1.
@@ -64,7 +68,7 @@ def advance(
         as_one: whether all are one program.
 
     Returns:
-        The states, or how a run diverged.
+        The states, or how a run diverged or why its rows could not be written.
 
     Raises:
         TaskError: if an environment fails, or hands over what it may not.
@@ -76,7 +80,7 @@ def advance(
         return _roll_out(runs, states, chosen)  # 3-6, 9
     if piece == _Piece.LEARN:  # 8, 10, 13
         if as_one:
-            return learn_together(runs, states, chosen)
+            return list(learn_together(runs, states, chosen))
         return [
             learn(run, state) if here else state
             for run, state, here in zip(runs, states, chosen, strict=True)
@@ -97,14 +101,14 @@ def _next(run: Run, state: RunState) -> _Piece:
 
 def _roll_out(
     runs: Sequence[Run], states: Sequence[RunState], chosen: Sequence[bool]
-) -> list[RunState | DivergenceError]:
+) -> list[Outcome]:
     """Lines 3 to 6, every team plays one episode, and 9."""
     playing = [c for c, here in enumerate(chosen) if here]
     for c in playing:
         runs[c].clock.begin_generation()
     plays = [to_play(runs[c], states[c]) for c in playing]
     results = runs[0].rollouts.play(plays)
-    after: list[RunState | DivergenceError] = list(states)
+    after: list[Outcome] = list(states)
     for c, play, result in zip(playing, plays, results, strict=True):
         if isinstance(result, DivergenceError):
             after[c] = result
@@ -119,9 +123,9 @@ def _roll_out(
 
 def _test(
     runs: Sequence[Run], states: Sequence[RunState], chosen: Sequence[bool], as_one: bool
-) -> list[RunState | DivergenceError]:
+) -> list[Outcome]:
     """Test episodes: a piece of its own, so that what came before is safe if one fails."""
-    after: list[RunState | DivergenceError] = list(states)
+    after: list[Outcome] = list(states)
     tested = [c for c, here in enumerate(chosen) if here]
     for group in [tested] if as_one else [[c] for c in tested]:
         found = test([runs[c] for c in group], [states[c] for c in group])

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from race import programs
 from race.algorithms.base import Tested
 from race.config.settings import Config
-from race.errors import DivergenceError
+from race.errors import DivergenceError, RunDirectoryError
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.training.keeping import keep_best
@@ -120,8 +120,12 @@ def checked(state: RunState, before: Progress) -> RunState | DivergenceError:
     return state
 
 
-def inject(run: Run, state: RunState) -> RunState:
-    """Line 11: the MARL team enters the population; the generation is over and has its row."""
+def inject(run: Run, state: RunState) -> RunState | RunDirectoryError:
+    """Line 11: the MARL team enters the population; the generation is over and has its row.
+
+    Returns:
+        The state, or why the row could not be written.
+    """
     key = jax.random.fold_in(
         root_key(run.config.seed, Purpose.INJECTION), state.progress.generation
     )
@@ -131,14 +135,21 @@ def inject(run: Run, state: RunState) -> RunState:
         algorithm = programs.inject(algorithm, key, hyper=state.hyper, **statics)
     progress = stamped(run, state.progress.but(learning=False))
     row = generation_row(run.config, run.algorithm, algorithm, state.losses, progress)
-    run.metrics.write(row)
+    try:
+        run.metrics.write(row)
+    except RunDirectoryError as error:
+        return error
     run.report("generation", progress, row)
     losses = programs.empty_losses(run.algorithm)
     return state._replace(algorithm=algorithm, losses=losses, progress=progress)
 
 
-def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
-    """Plays the test episodes of some runs and writes their rows."""
+def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState | RunDirectoryError]:
+    """Plays the test episodes of some runs and writes their rows.
+
+    Returns:
+        Of each the state, or why its row could not be written.
+    """
     groups: list[list[Trial]] = []
     teams: list[tuple[Tested, ...]] = []
     for run, state in zip(runs, states, strict=True):
@@ -157,7 +168,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
     ]
     # Of several runs failures are not told apart: each that took part counts all.
     repeated = rollouts.repeated - before
-    after = []
+    after: list[RunState | RunDirectoryError] = []
     for run, state, tested, found in zip(runs, states, teams, scores, strict=True):
         progress = state.progress
         progress = stamped(
@@ -165,8 +176,12 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState]:
             progress.but(evaluated_at=progress.env_steps, repeated=progress.repeated + repeated),
         )
         row = evaluation_row(progress, found)
-        run.metrics.write(row)
-        keep_best(run, tested, found, progress)
+        try:
+            run.metrics.write(row)
+            keep_best(run, tested, found, progress)
+        except RunDirectoryError as error:
+            after.append(error)
+            continue
         run.report("evaluation", progress, row)
         after.append(state._replace(progress=progress))
     return after

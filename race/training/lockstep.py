@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from race.errors import DivergenceError, RaceError, TaskError, command
+from race.errors import DivergenceError, RaceError, RunDirectoryError, TaskError, command
 from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.training.cohort import advance
@@ -44,7 +44,7 @@ def lockstep(members: list[Member], as_one: bool, results: Results) -> None:
 
     Raises:
         TaskError: if an environment fails, which ends all.
-        CheckpointError: if the only run cannot be saved.
+        RaceError: if the only run cannot be saved, or its rows not be written.
     """
     alone = len(members) == 1
     for member in list(members):
@@ -100,11 +100,13 @@ def _advance(members: list[Member], as_one: bool, results: Results, alone: bool)
         for run, kept in zip(runs, rows, strict=True):
             run.metrics.forget(kept)  # they are written again when the run goes on
         raise
-    for member, state in zip(list(members), after, strict=True):
-        if isinstance(state, DivergenceError):
-            _dismiss(member, state, members, results, alone)
+    for member, outcome in zip(list(members), after, strict=True):
+        if isinstance(outcome, DivergenceError):
+            _dismiss(member, outcome, members, results, alone)
+        elif isinstance(outcome, RunDirectoryError):
+            _leave_out(member, outcome, members, results, alone)
         else:
-            member.state = state
+            member.state = outcome
 
 
 def _saved(error: TaskError, members: Sequence[Member], results: Results) -> TaskError:
@@ -139,13 +141,24 @@ def _save(member: Member, members: list[Member], results: Results, alone: bool) 
         _dismiss(member, error, members, results, alone)
         return
     except RaceError as error:
-        if alone:
-            raise
-        members.remove(member)
-        results[member.place] = released(error)
+        _leave_out(member, error, members, results, alone)
         return
     if member.over:
         run_directory.mark_finished(member.run.directory.path)
+
+
+def _leave_out(
+    member: Member, error: RaceError, members: list[Member], results: Results, alone: bool
+) -> None:
+    """A run whose directory cannot be written; the only one is over with its error.
+
+    Raises:
+        RaceError: the error, if it is the only one.
+    """
+    if alone:
+        raise error
+    members.remove(member)
+    results[member.place] = released(error)
 
 
 def _dismiss(

@@ -14,9 +14,10 @@ from whole_runs import KilledError, rows, run
 
 from race.config.cohort import Batching
 from race.config.settings import Config
-from race.errors import ConfigError, DivergenceError, RaceError
+from race.errors import ConfigError, DivergenceError, RaceError, RunDirectoryError
 from race.runs import checkpoints
 from race.runs import directory as run_directory
+from race.runs.metrics import MetricsWriter
 from race.training import learning, lockstep
 from race.training.cohort import kind_of, together
 from race.training.run import Report, silent
@@ -211,6 +212,28 @@ def test_a_run_that_diverges_as_it_ends_stops_nobody(
         assert isinstance(result, Progress)
         assert result.env_steps >= config.env_steps
         assert run_directory.is_finished(tmp_path / f"seed{config.seed}")
+
+
+def test_a_run_whose_rows_cannot_be_written_stops_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = configs("matd3")
+    sound = MetricsWriter.write
+
+    def write(self: MetricsWriter, row: Any) -> None:
+        if self._path.parent.name == "seed2" and row["kind"] == "evaluation":
+            raise RunDirectoryError("the disk is full")
+        sound(self, row)
+
+    monkeypatch.setattr(MetricsWriter, "write", write)
+    results = train_all(tmp_path, made, "map")
+    assert isinstance(results[1], RunDirectoryError)
+    assert not run_directory.is_finished(tmp_path / "seed2")
+    for config, result in zip((made[0], made[2]), (results[0], results[2]), strict=True):
+        assert isinstance(result, Progress)
+        assert run_directory.is_finished(tmp_path / f"seed{config.seed}")
+    with pytest.raises(RunDirectoryError, match="full"):  # the only run ends with the error
+        train_all(tmp_path / "alone", made[1:2], "map")
 
 
 def test_runs_that_are_not_of_one_kind_are_refused(tmp_path: Path) -> None:
