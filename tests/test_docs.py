@@ -67,7 +67,17 @@ def shown(document: Path) -> list[str]:
     ]
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+LONG = (ROOT / "docs/runs.md", ROOT / "results/README.md")
+"""Documents whose commands take a minute and more."""
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        pytest.param(path, id=path.name, marks=[pytest.mark.slow] if path in LONG else [])
+        for path in DOCUMENTS
+    ],
+)
 def test_commands_in_documents_run(
     document: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -94,6 +104,7 @@ def test_commands_in_documents_run(
             exec(example, {})
 
 
+@pytest.mark.slow
 def test_modules_called_in_documents_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     shortened = {"cases": "", "tournament": "--battles 2 3s_vs_3z"}

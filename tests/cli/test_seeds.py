@@ -118,6 +118,7 @@ def test_a_seed_that_fails_is_named_and_the_others_are_trained(
     assert rows(path / "seed2")[-1]["env_steps"] >= 140
 
 
+@pytest.mark.slow
 def test_an_interrupt_stops_all_and_they_go_on_number_for_number(tmp_path: Path) -> None:
     path = tmp_path / "runs"
     long = SMALL.replace("--env-steps 120", "--env-steps 4000").replace("every 60", "every 500")
