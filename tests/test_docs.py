@@ -27,6 +27,7 @@ SMALL = {
     "export": "",
     "plot": "",
     "compare": "",
+    "report": "",
     "archive": "",
     "show": "",
     "sweep": "",

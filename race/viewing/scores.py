@@ -77,7 +77,8 @@ def scores_of(runs: Sequence[Recorded], metric: str = "auto", team: str = "selec
     names = chosen.names_of(runs)
     differences: list[str] = []
     found: dict[tuple[str, str], list[tuple[Recorded, str, Curve, Curve]]] = {}
-    for run, name in zip(runs, names, strict=True):
+    for whole_run, name in zip(runs, names, strict=True):
+        run = whole_run._replace(rows=tests_and_end(whole_run.rows))
         key, wanted = _key(run, metric, team)
         curve = chosen.curve_of(run, key, "env_steps")
         minutes = chosen.curve_of(run, key, "wall_time")
@@ -106,6 +107,11 @@ def scores_of(runs: Sequence[Recorded], metric: str = "auto", team: str = "selec
                     )
                 )
     return Scores(scored, horizons, differences)
+
+
+def tests_and_end(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """What curves of tests need: the tests, and how far the run came."""
+    return [row for row in rows[:-1] if row.get("kind") == "evaluation"] + rows[-1:]
 
 
 def _key(run: Recorded, metric: str, team: str) -> tuple[str, str]:

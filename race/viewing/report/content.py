@@ -15,7 +15,7 @@ from race.viewing.comparison import compare
 from race.viewing.curves import Axis
 from race.viewing.plotting import colours_of
 from race.viewing.report import evolution
-from race.viewing.scores import scores_of
+from race.viewing.scores import scores_of, tests_and_end
 from race.viewing.tables import LEGEND, as_json, estimate, remarks, seconds, tables_of
 
 TEST_METRICS = ("return_mean", "win_rate", "length_mean")
@@ -140,6 +140,7 @@ def _binned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _bands(runs: Sequence[Recorded], names: Sequence[str]) -> list[dict[str, Any]]:
     """Means with intervals of all seeds, as `race plot` draws them."""
     found = []
+    runs = [run._replace(rows=tests_and_end(run.rows)) for run in runs]
     for task, name in sorted({(r.config.task, n) for r, n in zip(runs, names, strict=True)}):
         mine = [r for r, n in zip(runs, names, strict=True) if (r.config.task, n) == (task, name)]
         for metric in TEST_METRICS:
