@@ -36,6 +36,7 @@ from race.training.run_state import Progress
 from race.training.trainer import is_over
 from race.training.trainer import train as train_in
 from race.viewing import filming
+from race.viewing.logged import logged
 from race.viewing.progress import TrainingDisplay
 from race.viewing.wanted import check_seed, check_video
 
@@ -346,7 +347,8 @@ def _train(
             if stopped:
                 interrupts.stop()
 
-        made = train_in(path, config, extend=extend, report=report, interrupts=interrupts)
+        with logged(path, config, report) as told:
+            made = train_in(path, config, extend=extend, report=told, interrupts=interrupts)
     if failures:
         raise failures[0]
     if not is_over(config, made) and not stopped:

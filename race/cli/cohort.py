@@ -5,6 +5,7 @@ Each run is a directory made before. Exits with 0 if all are finished, 130 if th
 """
 
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -16,6 +17,7 @@ from race.runs import directory as run_directory
 from race.training.run import Report
 from race.training.run_state import Progress
 from race.training.trainer import Order, is_over, train_cohort
+from race.viewing.logged import logged
 from race.viewing.progress import test_summary
 
 
@@ -25,9 +27,14 @@ def main(arguments: list[str]) -> int:
     assert batching in get_args(Batching), batching
     paths = [Path(place) for place in places]
     try:
-        orders = [Order(p, run_directory.open_run(p), report=_report(p)) for p in paths]
-        use_cache(orders[0].config.compute)  # runs of a cohort are alike
-        results = train_cohort(orders, batching=cast(Batching, batching))
+        with ExitStack() as loggers:
+            orders = []
+            for path in paths:
+                config = run_directory.open_run(path)
+                report = loggers.enter_context(logged(path, config, _report(path)))
+                orders.append(Order(path, config, report=report))
+            use_cache(orders[0].config.compute)  # runs of a cohort are alike
+            results = train_cohort(orders, batching=cast(Batching, batching))
     except RaceError as error:
         say(f"race: {error}")
         return 1

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from race.config.cohort import CohortConfig
+from race.config.loggers import LoggerName
 from race.errors import ConfigError, RunDirectoryError, command
 
 
@@ -40,6 +41,8 @@ class Sweep:
     """Say what would be run, and run nothing."""
     jobs: int | None = None
     """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    log: tuple[LoggerName, ...] = ()
+    """Programs that new runs tell every row besides (`race train --help`)."""
     cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
@@ -58,7 +61,7 @@ def main(arguments: list[str]) -> None:
     if chosen.dry_run:
         _show(path, runs, chosen)
         return
-    _create(path, runs)
+    _create(path, runs, chosen.log)
     run_all(path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort)
 
 
@@ -109,13 +112,15 @@ def _name(config: Any, varied: dict[str, Any]) -> str:
     return re.sub(r"[^\w.=+-]+", "_", plain).strip("_")
 
 
-def _create(path: Path, runs: dict[str, Any]) -> None:
+def _create(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> None:
     """Makes the run directories that are not there, or none if one that is there is another."""
     from race.cli.train import tried
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.runs.loggers.sending import choose, refuse_missing
 
+    refuse_missing(log)
     missing = {}
     for name, config in runs.items():
         if not (path / name / "config.json").exists():
@@ -133,6 +138,7 @@ def _create(path: Path, runs: dict[str, Any]) -> None:
             task = make_task(*key)
             described[key] = describe(task) | tried(config.task, task)
         run_directory.create(path / name, config, described[key])
+        choose(path / name, log)
 
 
 def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:

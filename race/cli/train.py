@@ -12,6 +12,7 @@ from race.config.ablations import AblationName
 from race.config.cohort import CohortConfig
 from race.config.compute import ComputeConfig
 from race.config.files import Wanted, read_wanted
+from race.config.loggers import LoggerName
 from race.config.presets import resolve
 from race.config.settings import (
     Algo,
@@ -65,6 +66,9 @@ class Train:
     init_from: Annotated[str | None, tyro.conf.arg(metavar="DIR")] = None
     """Begin with the teams of another run in place of random ones: its MARL team as the MARL team,
     its champion as the first team of the population. Networks must have the same sizes."""
+    log: tuple[LoggerName, ...] = ()
+    """Programs that are told every row besides: tensorboard (in RUN_DIR/tensorboard), wandb,
+    mlflow, trackio, each an extra of race-marl. A resumed run goes on in the same one."""
     run_dir: Path | None = None
     """Where the run is kept. Default: runs/TASK-ALGO-seedN, with --seeds runs/TASK-ALGO; names of
     ablations follow ALGO."""
@@ -104,8 +108,11 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.runs.loggers.sending import choose, refuse_missing
     from race.teams.heirloom import heirloom_of
     from race.training.asking import name_of, settled_with_file, usual_directory
+
+    refuse_missing(chosen.log)
 
     if chosen.seeds is not None:  # this process only watches
         os.environ.update(SHARED_ACCELERATOR)
@@ -120,6 +127,7 @@ def main(arguments: list[str]) -> None:
         begins_with = heirloom_of(config, task)
         run_directory.create(path, config, describe(task) | tried(asked.task, task))
         begins_with.hand_to(path)
+        choose(path, chosen.log)
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
@@ -146,6 +154,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     from race.config.seeds import parse_seeds
     from race.envs.description import describe
     from race.runs import directory as run_directory
+    from race.runs.loggers.sending import choose
     from race.teams.heirloom import heirloom_of
 
     seeds = parse_seeds(str(chosen.seeds))
@@ -166,6 +175,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     for place, one in zip(places, configs, strict=True):
         run_directory.create(place, one, described)
         begins_with.hand_to(place)
+        choose(place, chosen.log)
 
 
 def _parse(arguments: list[str]) -> Train:

@@ -10,6 +10,7 @@ from race.compilation import use_cache
 from race.config.settings import Config
 from race.errors import command, say
 from race.training.trainer import is_over, train
+from race.viewing.logged import logged
 from race.viewing.progress import TrainingDisplay
 
 
@@ -23,13 +24,16 @@ def run(path: Path, config: Config, *, extend: bool = False, without_metrics: bo
         f"{config.method} on {config.task}, seed {config.seed}, in {path}", soft_wrap=True
     )
     began = time.perf_counter() - seconds_since_start()
-    with TrainingDisplay(config, console) as display:
+    with (
+        TrainingDisplay(config, console) as display,
+        logged(path, config, display.report) as report,
+    ):
         progress = train(
             path,
             config,
             extend=extend,
             without_metrics=without_metrics,
-            report=display.report,
+            report=report,
             began=began,
         )
     if not is_over(config, progress):
