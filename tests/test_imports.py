@@ -27,6 +27,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
             {"training"},
             {"teams"},
             {"viewing"},
+            {"reproduce"},
             {"doctor"},
             {"bench"},
             {"api"},

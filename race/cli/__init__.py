@@ -18,6 +18,7 @@ _BEGAN = time.perf_counter()
 COMMANDS = {
     "train": "train a team",
     "sweep": "train many runs: combinations of settings, seeds, tasks",
+    "reproduce": "make figures of the paper: plan, train what is missing, draw",
     "resume": "go on with a run exactly where it was",
     "evaluate": "play test episodes with a trained team and report its returns",
     "render": "make a video of a trained team, or of a battle",

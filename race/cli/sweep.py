@@ -59,9 +59,9 @@ def main(arguments: list[str]) -> None:
     runs = _planned(_read(chosen.file))
     path = chosen.run_dir or Path("runs") / chosen.file.stem
     if chosen.dry_run:
-        _show(path, runs, chosen)
+        show_plan(path, runs, chosen.cohort)
         return
-    _create(path, runs, chosen.log)
+    create_runs(path, runs, chosen.log)
     run_all(path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort)
 
 
@@ -112,7 +112,7 @@ def _name(config: Any, varied: dict[str, Any]) -> str:
     return re.sub(r"[^\w.=+-]+", "_", plain).strip("_")
 
 
-def _create(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> None:
+def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> None:
     """Makes the run directories that are not there, or none if one that is there is another."""
     from race.cli.train import tried
     from race.envs import make_task
@@ -141,7 +141,8 @@ def _create(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> No
         choose(path / name, log)
 
 
-def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:
+def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
+    """Lists runs, the process of each, and the memory of its replay buffer."""
     from race.cli import streams
     from race.cli.fleet import accelerators, crews
     from race.cli.worker import Watched
@@ -149,7 +150,7 @@ def _show(path: Path, runs: dict[str, Any], chosen: Sweep) -> None:
 
     console = streams.console()
     watched = [Watched(path / name, config) for name, config in runs.items()]
-    groups = crews(watched, chosen.cohort.batching, chosen.cohort.width, accelerators())
+    groups = crews(watched, cohort.batching, cohort.width, accelerators())
     longest = max(map(len, runs))
     console.print(f"{'run':<{longest}}  process       steps   replay  state", soft_wrap=True)
     sizes: dict[Any, int] = {}

@@ -134,7 +134,7 @@ def _panel(
     for (method, name), runs in sorted(methods.items(), reverse=True):
         band = aggregate(runs, bounds_of(metric))
         label = next((n for n, text in LABELS.items() if name.endswith(text)), "selected")
-        _draw(axes, band, runs, colours[method, name], _LINES[label], name, with_seeds)
+        draw(axes, band, runs, colours[method, name], _LINES[label], name, with_seeds)
         found.append(
             Summary(
                 task,
@@ -147,11 +147,11 @@ def _panel(
                 tuple(ended_early(runs)),
             )
         )
-    _frame(axes, task, metric, axis)
+    frame(axes, task, metric, axis)
     return found
 
 
-def _draw(
+def draw(
     axes: Axes, band: Band, runs: list[Curve], colour: str, line: str, name: str, with_seeds: bool
 ) -> None:
     """A mean with what surrounds it; fainter where some of its runs have already ended."""
@@ -198,7 +198,8 @@ def _colours(methods: Methods) -> dict[tuple[str, str], str]:
     return taken
 
 
-def _frame(axes: Axes, task: str, metric: str, axis: Axis) -> None:
+def frame(axes: Axes, task: str, metric: str, axis: Axis) -> None:
+    """Names and limits of a panel's axes, and its legend."""
     axes.set_title(task)
     axes.set_ylabel(_AXES.get(metric, metric))
     axes.autoscale_view()

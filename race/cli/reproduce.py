@@ -1,0 +1,163 @@
+"""``race reproduce``."""
+
+import os
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from race.config.cohort import CohortConfig
+from race.config.loggers import LoggerName
+from race.config.settings import (
+    CheckpointConfig,
+    Config,
+    EvaluationConfig,
+    FacmacConfig,
+    LearnerConfig,
+    Preset,
+    RaceConfig,
+)
+from race.errors import ConfigError, RaceError
+
+Wanted = Literal["fig2", "fig3", "fig4", "fig5", "fig6", "fig7", "fig8", "all"]
+
+
+@dataclass(frozen=True)
+class Reproduce:
+    """Make figures of the paper: plan their runs, train what is missing, draw.
+
+    fig2 and fig3: RACE, MERL, the gradient learners and EA on Multi-Agent MuJoCo and StarCraft's
+    maps; fig4: what became of injected teams; fig5 to fig8: ablations, alpha, beta, on four tasks
+    of our choice, since the paper does not name its own. Given again, the same command goes on with
+    what is unfinished, leaves what is done, and draws anew. All of the paper is months of work for
+    one machine: look at --dry-run, --tasks and --scale first.
+    """
+
+    figures: Annotated[tuple[Wanted, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FIG...")]
+    """fig2 ... fig8, or all."""
+    seeds: str = "1-5"
+    """Seeds of every curve, such as 1-5 or 1,4,7."""
+    tasks: tuple[str, ...] = ()
+    """These tasks instead of the figure's."""
+    env_steps: int | None = None
+    """Environment steps of every run. None: the paper's, one million, on three maps two."""
+    scale: float = 1.0
+    """The same plan on so much of the budget: 0.1 is a tenth."""
+    jobs: int | None = None
+    """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    dir: Path = Path("runs/reproduce")
+    """Where runs and figures are kept."""
+    dry_run: bool = False
+    """Say what would be run, with memory and, where runs of the kind have begun, time."""
+    draw_only: bool = False
+    """Draw what there is and run nothing."""
+    team: Literal["selected", "marl", "champion", "best"] = "selected"
+    """Whose tests are drawn. best, the larger of two tests, is what the paper shows: biased."""
+    preset: Preset = "paper"
+    """Learner settings to start from, on tasks with continuous actions."""
+    log: tuple[LoggerName, ...] = ()
+    """Programs that new runs tell every row besides (`race train --help`)."""
+    learner: LearnerConfig = field(default_factory=LearnerConfig)
+    facmac: FacmacConfig = field(default_factory=FacmacConfig)
+    race: RaceConfig = field(default_factory=RaceConfig)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+    checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    cohort: CohortConfig = field(default_factory=CohortConfig)
+
+
+def main(arguments: list[str]) -> None:
+    """Parses the arguments, plans, trains, draws."""
+    chosen = tyro.cli(Reproduce, args=arguments, prog="race reproduce")
+    from race.cli.fleet import check_jobs, run_all
+    from race.cli.sweep import create_runs, show_plan
+    from race.cli.worker import SHARED_ACCELERATOR
+    from race.compilation import use_cache
+    from race.config.seeds import parse_seeds
+    from race.reproduce.figures import FIGURES
+    from race.reproduce.planning import plan
+
+    if not chosen.figures:
+        raise ConfigError("Say which figure: race reproduce {fig2,...,fig8,all}")
+    check_jobs(chosen.jobs)
+    figures = tuple(FIGURES) if "all" in chosen.figures else tuple(dict.fromkeys(chosen.figures))
+    groups = ("learner", "facmac", "race", "evaluation", "checkpoint")
+    made = plan(
+        figures,
+        parse_seeds(chosen.seeds),
+        Config("", **{name: getattr(chosen, name) for name in groups}),
+        tasks=chosen.tasks,
+        env_steps=chosen.env_steps,
+        scale=chosen.scale,
+        preset=chosen.preset,
+    )
+    os.environ.update(SHARED_ACCELERATOR)  # this process only watches
+    use_cache()
+    if chosen.dry_run:
+        show_plan(chosen.dir, made.runs, chosen.cohort)
+        print(_time(chosen.dir, made.runs))
+        return
+    failure = None
+    if not chosen.draw_only:
+        create_runs(chosen.dir, made.runs, chosen.log)
+        places = [chosen.dir / name for name in made.runs]
+        try:
+            run_all(chosen.dir, places, jobs=chosen.jobs, cohort=chosen.cohort)
+        except RaceError as error:  # what the others did is drawn all the same
+            failure = error
+    _draw(chosen, figures, made)
+    if failure is not None:
+        raise failure
+
+
+def _draw(chosen: Reproduce, figures: tuple[str, ...], made: Any) -> None:
+    from race.reproduce.drawing import draw_figure
+    from race.reproduce.figures import FIGURES
+    from race.runs import results
+    from race.runs.directory import RunDirectory
+
+    there = [n for n in made.runs if RunDirectory(chosen.dir / n).config.exists()]
+    if not there:
+        raise RaceError(
+            f"There is no run of these figures in {chosen.dir}. Leave --draw-only away to train "
+            "them, or name the folder with --dir."
+        )
+    recorded = {name: results.of_directory(chosen.dir / name) for name in there}
+    for figure in figures:
+        runs = [(recorded[n], p) for n in there for p in made.seen[n] if p.figure == figure]
+        tasks, out = chosen.tasks or FIGURES[figure].tasks, chosen.dir / f"{figure}.png"
+        drawn = draw_figure(figure, runs, tasks, chosen.team, out)
+        if drawn is None:
+            print(f"{figure}: nothing to draw yet.", file=sys.stderr)
+            continue
+        print(f"Figure: {drawn.file}")
+        print(*(f"Missing: {gap}." for gap in drawn.gaps), sep="\n", end="", file=sys.stderr)
+        absent = sum(any(p.figure == figure for p in made.seen[n]) for n in made.runs) - len(runs)
+        if absent > 0:
+            print(f"Missing: {figure}: {absent} runs are not begun.", file=sys.stderr)
+
+
+def _time(path: Path, runs: dict[str, Config]) -> str:
+    """How long it may take, from runs of the same task and method that have begun."""
+    from race.cli.worker import Watched
+
+    speeds: dict[tuple[str, str], list[float]] = {}
+    left: dict[tuple[str, str], float] = {}
+    for name, config in runs.items():
+        run, kind = Watched(path / name, config), (config.task, config.method)
+        run.look()
+        steps, seconds = run.row.get("env_steps", 0), run.row.get("wall_seconds", 0.0)
+        if steps and seconds:
+            speeds.setdefault(kind, []).append(steps / seconds)
+        short = 0 if run.ended else max(config.env_steps - steps, 0)
+        left[kind] = left.get(kind, 0.0) + short
+    known = {kind: left[kind] * len(s) / sum(s) for kind, s in speeds.items()}
+    unknown = sum(steps for kind, steps in left.items() if kind not in known)
+    said = []
+    if known:
+        hours = sum(known.values()) / 3600
+        said.append(f"{hours:,.1f} hours of one process, by the speed of runs that have begun")
+    if unknown:
+        said.append(f"{unknown:,.0f} steps of tasks and methods of which no run has begun yet")
+    return f"Time left: {'; '.join(said) or 'none'}."
