@@ -28,7 +28,8 @@ SMALL = {
     "plot": "",
     "compare": "",
     "report": "",
-    "reproduce": "--scale 0.0007 --learner.hidden-sizes 10 8 --learner.random-steps 600 --evaluation.episodes 1",
+    "reproduce": "--scale 0.0007 --learner.hidden-sizes 10 8 --learner.batch-size 4 "
+    "--learner.random-steps 600 --evaluation.episodes 1",
     "archive": "",
     "show": "",
     "sweep": "",
