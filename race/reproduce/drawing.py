@@ -59,29 +59,36 @@ def draw_figure(
         return None
     columns = min(len(shown), 4)
     rows = math.ceil(len(shown) / columns)
-    canvas = Canvas(figsize=(4.2 * columns, 3.9 * rows), layout="constrained")
+    canvas = Canvas(figsize=(max(4.2 * columns, 6.4), 4.4 * rows), layout="constrained")
     FigureCanvasAgg(canvas)
+    rings = False
     labels = {label for curves in shown.values() for label in curves}
     for number, (task, curves) in enumerate(shown.items()):
         axes = canvas.add_subplot(rows, columns, number + 1)
         order = [v.label for d in (False, True) for v in variants(name, d) if v.label in labels]
         hues = dict(zip(dict.fromkeys(order), _COLOURS * 3, strict=False))
         for label in [label for label in hues if label in curves]:
-            _curve(axes, name, task, label, curves[label], hues[label])
+            rings |= _curve(axes, name, task, label, curves[label], hues[label])
         frame(axes, task, _metric(task, runs), "env_steps")
-    canvas.suptitle(f"{name}: {figure.title}. Rings: the paper's, read off its figures")
+        axes.legend(
+            frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.22)
+        )
+    told = "; rings: the paper's numbers" if rings else ""
+    canvas.suptitle(f"{name}: {figure.title}{told}", fontsize="medium")
     with written_aside(out) as temporary:
         canvas.savefig(temporary, dpi=130)
     return Drawn(out, gaps)
 
 
-def _curve(axes: Axes, name: str, task: str, label: str, curves: list[Curve], colour: str) -> None:
+def _curve(axes: Axes, name: str, task: str, label: str, curves: list[Curve], colour: str) -> bool:
+    """Draws a curve, and the paper's numbers if there are any: then True."""
     band = aggregate(curves, bounds_of("win_rate" if task.startswith("micro/") else ""))
     draw(axes, band, curves, colour, "-", label, True)
     told = [(x, y) for x, y in paper.points(name, task, label) if x <= 1.05 * band.x[-1]]
     if told:
         x, y = zip(*told, strict=True)
         axes.plot(x, y, "o", color=colour, alpha=0.45, fillstyle="none", markersize=7)
+    return bool(told)
 
 
 def _metric(task: str, runs: Sequence[tuple[Recorded, Place]]) -> str:
@@ -123,7 +130,7 @@ def _draw_rates(
     shown = [task for task in tasks if task in ends]
     if not shown:
         return None
-    canvas = Canvas(figsize=(2 + 1.1 * len(shown), 4.4), layout="constrained")
+    canvas = Canvas(figsize=(max(2 + 1.1 * len(shown), 6.4), 4.4), layout="constrained")
     FigureCanvasAgg(canvas)
     axes = canvas.add_subplot()
     for side, (label, colour) in enumerate(zip(_RATES, ("#d62728", "#8b93a1"), strict=True)):
@@ -137,7 +144,7 @@ def _draw_rates(
     )
     axes.set_ylim(0, 1)
     axes.set_ylabel("share of injected MARL teams")
-    axes.set_title(f"{name}: what became of the MARL team in the population (95% intervals)")
+    axes.set_title(f"{name}: what became of injected MARL teams (95%)", fontsize="medium")
     axes.legend(frameon=False)
     with written_aside(out) as temporary:
         canvas.savefig(temporary, dpi=130)

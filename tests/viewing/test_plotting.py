@@ -185,13 +185,13 @@ def test_what_cannot_be_drawn_says_why(tmp_path: Path) -> None:
 def lines_of(monkeypatch: pytest.MonkeyPatch, paths: list[Path], out: Path, **how: Any) -> Any:
     """The axes of the one panel of a figure."""
     panels = []
-    frame = plotting._frame
+    frame = plotting.frame
 
     def spy(axes: Any, *rest: Any) -> None:
         frame(axes, *rest)
         panels.append(axes)
 
-    monkeypatch.setattr(plotting, "_frame", spy)
+    monkeypatch.setattr(plotting, "frame", spy)
     plot(paths, out, **how)
     return panels[0]
 
