@@ -31,6 +31,7 @@ SMALL = {
     "show": "",
     "sweep": "",
     "list": "",
+    "describe": "",
     "doctor": "",
 }
 
