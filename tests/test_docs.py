@@ -34,6 +34,7 @@ SMALL = {
     "show": "",
     "sweep": "",
     "list": "",
+    "describe": "",
     "doctor": "",
 }
 

@@ -29,6 +29,7 @@ COMMANDS = {
     "show": "show what a run is, without running any code of it",
     "archive": "put the results of many runs into one small file",
     "list": "show tasks, algorithms, ablations and presets",
+    "describe": "show who sees what and moves what in a task",
     "bench": "measure speed and memory on this machine",
     "doctor": "show what is installed, what is missing and how to mend it",
 }

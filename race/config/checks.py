@@ -236,6 +236,12 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
         ),
         (0 <= env.retries <= 1000, "env.retries", env.retries, "0 to 1000"),
         (
+            0 < env.reward_scale <= 1e6,
+            "env.reward-scale",
+            env.reward_scale,
+            "above 0, at most 1000000",
+        ),
+        (
             env.step_seconds is None or 0 < env.step_seconds <= 1e6,
             "env.step-seconds",
             env.step_seconds,

@@ -171,6 +171,7 @@ def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]
     if not asked.has_marl:
         why = f"with --algo {algo}, where nothing is learned by gradients"
         yield "base", why
+        yield "env.reward_scale", why
         group, kind = ("facmac", FacmacConfig) if discrete else ("learner", LearnerConfig)
         idle = (name for name in _names(kind) if name not in NETWORKS[group])
         yield from ((f"{group}.{name}", why) for name in idle)

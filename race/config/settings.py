@@ -262,6 +262,9 @@ class EnvConfig:
     max_cycles."""
     largest_observation: int = 4096
     """Most entries of what an agent observes, and of the environment's own state."""
+    reward_scale: float = 1.0
+    """What rewards are multiplied by before anything is learned from them. Returns, in metrics and
+    for the population's fitness, stay in the task's own units."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
     enough cores), and where steps have a time limit."""
@@ -412,6 +415,7 @@ _BEFORE: dict[str, Any] = {
     "state": "auto",
     "episode_limit": None,
     "largest_observation": 4096,
+    "reward_scale": 1.0,
 }
 
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from race.envs.checked import CheckedEnv
-from race.envs.pettingzoo import TeamEnv, conflict
+from race.envs.pettingzoo import conflict
 from race.errors import TaskError
 from race.types import AnyTask, Task
 
@@ -32,7 +32,7 @@ def try_out(task: AnyTask) -> Trial:
     env = CheckedEnv(task)
     try:
         first, second = _begin(env, task), _begin(env, task)
-        found = conflict.look(env.env) if isinstance(env.env, TeamEnv) else None
+        found = conflict.look(env)
     finally:
         with contextlib.suppress(TaskError):  # it would hide what was wrong; it is told in training
             env.close()

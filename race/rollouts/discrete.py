@@ -97,7 +97,10 @@ class EpisodeRollouts:
                 continue
             replay = play.replay
             if replay.capacity:
-                replay = programs.store(replay, played.episodes, np.int32(play.teams.count))
+                episodes, scale = played.episodes, play.config.env.reward_scale
+                if scale != 1:  # returns stay in the task's own units
+                    episodes = episodes._replace(reward=episodes.reward * np.float32(scale))
+                replay = programs.store(replay, episodes, np.int32(play.teams.count))
             returns = np.asarray(played.episode_return, np.float64)
             steps = int(np.sum(played.episodes.length))
             results.append((replay, Generation(returns, steps, now - before)))

@@ -110,7 +110,7 @@ class TransitionRollouts:
                 return generator.uniform(-1, 1, shape).astype(np.float32)
 
             rollout = collect(self._pool, choose, seeds[:-1], max_ticks=missing // playing)
-            replay = store(replay, rollout.transitions)
+            replay = store(replay, scaled(rollout.transitions, config.env.reward_scale))
             collected += len(rollout.transitions.reward)
             index += 1
         return replay, collected
@@ -125,7 +125,8 @@ class TransitionRollouts:
                 continue
             replay = play.replay
             if replay.capacity:
-                replay = store(replay, played.transitions)
+                scale = play.config.env.reward_scale
+                replay = store(replay, scaled(played.transitions, scale))
             steps, repeated = len(played.transitions.reward), int(played.repeated.sum())
             results.append((replay, Generation(played.episode_return, steps, repeated)))
         return results
@@ -250,6 +251,13 @@ def _joined(parts: list[Score]) -> Score:
         np.concatenate([part.returns for part in parts]),
         np.concatenate([part.lengths for part in parts]),
     )
+
+
+def scaled(transitions: Transition, scale: float) -> Transition:
+    """Steps as they are learned from: what they were paid is multiplied."""
+    if scale == 1:
+        return transitions
+    return transitions._replace(reward=transitions.reward * np.float32(scale))
 
 
 def store(replay: Replay, transitions: Transition) -> Replay:

@@ -497,3 +497,20 @@ def test_ablations_are_named_recorded_and_refused(
     error = fails("train probe/target --algo matd3 --ablation vmm-only", capsys)
     assert "another method" in error
     assert "--ablation" in fails("train probe/target --ablation vmm", capsys)
+
+
+def test_describe(capsys: pytest.CaptureFixture[str]) -> None:
+    race("describe mamujoco/Humanoid-9x8")
+    text = capsys.readouterr().out
+    assert "2 agents with continuous actions" in text
+    assert "ends after 1,000 steps" in text
+    assert re.search(r" 3  right_shoulder1 +-0.4 to 0.4, entry 11 of the joint action\n", text)
+    assert re.search(r"\n +0  abdomen_x position +entry 7 of the state\n", text)
+    race("describe probe/matching")
+    text = capsys.readouterr().out
+    assert "every agent (agent 0, agent 1) observes 4 entries, which have no names" in text
+    race("describe pettingzoo:mpe2.simple_tag_v3 --env.agents adversary_* --json")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["n_agents"], told["other_agents"]) == (3, ["agent_0"])
+    assert len(told["names"]["state"]) == told["state_size"] == 62
+    assert "no task 'mamujoco/Hoper-3x1'" in fails("describe mamujoco/Hoper-3x1", capsys)

@@ -247,6 +247,9 @@ def test_a_state_may_be_gone_when_the_task_is_over() -> None:
 
 
 def test_states_that_are_none() -> None:
+    typo = type("Typo", (games.Numbers,), {"state": lambda self: self.tiem})
+    with pytest.raises(TaskError, match=r"environment failed: AttributeError.*tiem"):
+        state_task(typo)
     with pytest.raises(TaskError, match="has no state"):
         state_task(games.Numbers, state="environment")
     grown = type("Grown", (games.Numbers,), {"state": lambda self: np.zeros(1 + self.time)})
@@ -302,6 +305,16 @@ def test_rivals_are_told_apart() -> None:
     friends = try_out(parallel_task(games.Rivals, None, EnvConfig(agents="cat_*")))
     assert (friends.conflict, friends.note) == (None, "")
     assert friends.repeats
+
+
+def test_an_environment_that_fails_later_is_tried_all_the_same() -> None:
+    class Fails(games.Rivals):
+        def step(self, actions: Any) -> Any:
+            if self.time == 3:
+                raise OSError("the mouse is gone")
+            return super().step(actions)
+
+    assert try_out(parallel_task(Fails)).conflict is None
 
 
 def test_opposed_rewards() -> None:

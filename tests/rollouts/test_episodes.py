@@ -447,6 +447,22 @@ def test_training_is_the_same_on_host_and_device(name: str) -> None:
     assert len(np.unique(starts, axis=0)) > 5
 
 
+@pytest.mark.parametrize("on_device", [False, True])
+def test_rewards_are_scaled_and_returns_are_not(on_device: bool) -> None:
+    task, plain = task_of("countdown"), config_of("countdown", replay_capacity=13)
+    small = dataclasses.replace(plain, env=dataclasses.replace(plain.env, reward_scale=0.25))
+    teams, found = teams_of(task.spec, plain.n_teams), []
+    for config in (plain, small):
+        with EpisodeRollouts(config, task, on_device) as rollouts:
+            replay = rollouts.empty_replay(config)
+            found.append(generation_of(rollouts, config, teams, 0, 0, replay))
+    (whole, told), (part, same) = found
+    np.testing.assert_array_equal(told.episode_return, same.episode_return)
+    assert np.abs(whole.data.reward).max() > 0
+    np.testing.assert_array_equal(part.data.reward, np.float32(0.25) * whole.data.reward)
+    assert_same(part.data._replace(reward=0), whole.data._replace(reward=0))
+
+
 @pytest.mark.parametrize(("name", "on_device"), [("probe/memory", True), ("probe/lives", False)])
 def test_tests_give_every_team_the_same_seeds(
     name: str, on_device: bool, monkeypatch: pytest.MonkeyPatch

@@ -1,13 +1,16 @@
 """Whether what one agent of a team is paid for costs another: told, since then it is no team."""
 
+import contextlib
 import time
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float
 
+from race.envs.checked import CheckedEnv
 from race.envs.pettingzoo.environment import TeamEnv
+from race.errors import EnvFailedError
 
 _STEPS: Final = 2000
 _SECONDS: Final = 4.0  # of slow environments fewer steps are looked at
@@ -30,19 +33,26 @@ class Conflict(NamedTuple):
     correlation: float
 
 
-def look(env: TeamEnv) -> Conflict | None:
+def look(env: CheckedEnv) -> Conflict | None:
     """Plays at random and compares what the agents of a team are paid.
 
+    An environment that fails meanwhile is looked at no further: whether that ends a run is decided
+    in training.
+
+    Args:
+        env: the environment; one whose agents' rewards are not known is not looked at.
+
     Raises:
-        HandedOverError: if what the environment shows breaks its interface.
+        HandedOverError: if what it shows breaks the contract.
     """
-    if len(env.parallel.team) < 2:
+    team = env.env
+    if not isinstance(team, TeamEnv) or len(team.parallel.team) < 2:
         return None
-    found = opposed(_rewards(env))
+    found = opposed(_rewards(env, team))
     if found is None:
         return None
     one, other, correlation = found
-    return Conflict(str(env.parallel.team[one]), str(env.parallel.team[other]), correlation)
+    return Conflict(str(team.parallel.team[one]), str(team.parallel.team[other]), correlation)
 
 
 def opposed(rewards: Float[np.ndarray, "steps N"]) -> tuple[int, int, float] | None:
@@ -63,21 +73,22 @@ def opposed(rewards: Float[np.ndarray, "steps N"]) -> tuple[int, int, float] | N
     return first, second, lowest
 
 
-def _rewards(env: TeamEnv) -> Float[np.ndarray, "steps N"]:
+def _rewards(env: CheckedEnv, team: TeamEnv) -> Float[np.ndarray, "steps N"]:
     random = np.random.default_rng(0)
     found: list[list[float]] = []
     began, episode, over = time.monotonic(), 0, True
-    seen = None
-    while len(found) < _STEPS and time.monotonic() - began < _SECONDS:
-        if over:
-            seen, _ = env.reset(seed=episode)
-            episode += 1
-        if isinstance(env.action_space, spaces.Box):
-            action = random.uniform(env.action_space.low, env.action_space.high)
-        else:
-            assert isinstance(seen, dict)
-            action = np.array([random.choice(np.flatnonzero(row)) for row in seen["avail_actions"]])
-        seen, _, terminated, truncated, _ = env.step(action)
-        over = terminated or truncated
-        found.append(list(env.parallel.rewards))
-    return np.array(found)
+    seen: Any = None
+    with contextlib.suppress(EnvFailedError):
+        while len(found) < _STEPS and time.monotonic() - began < _SECONDS:
+            if over:
+                seen = env.reset(episode)
+                episode += 1
+            if isinstance(team.action_space, spaces.Box):
+                units = random.uniform(team.action_space.low, team.action_space.high)
+                step = env.step(units.astype(np.float32))
+            else:
+                rows = seen.avail_actions
+                step = env.step(np.array([random.choice(np.flatnonzero(row)) for row in rows]))
+            seen, over = step.seen, step.terminated or step.truncated
+            found.append(list(team.parallel.rewards))
+    return np.array(found).reshape(len(found), len(team.parallel.team))

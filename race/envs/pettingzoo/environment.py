@@ -101,6 +101,11 @@ class TeamEnv(gymnasium.Env[Any, Any]):
             }
         )
 
+    @property
+    def own_state_names(self) -> list[str] | None:
+        """Names of the entries of the environment's own state; None if it is not in use."""
+        return None if self._own_state is None else self._own_state.names()
+
     def obs_index(self) -> list[list[int]]:
         """For each agent of a team that acts by numbers, where in the state its observation is."""
         parallel = self.parallel

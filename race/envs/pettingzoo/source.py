@@ -20,6 +20,7 @@ PREFIX: Final = "pettingzoo:"
 _MAKERS: Final = ("parallel_env", "env", "raw_env")
 """What modules of PettingZoo's family call what makes their environment; the first is preferred."""
 _LIMITS: Final = ("max_cycles", "max_steps", "max_episode_steps")
+"""What environments call their step limit; the first is PettingZoo's own word."""
 
 
 class Opened(NamedTuple):
@@ -127,11 +128,11 @@ def opened(env: Any) -> Opened:
 def limit_of(env: Any) -> int | None:
     """The step limit that an environment tells of itself; None if it does not.
 
-    It is looked for as ``max_cycles``, ``max_steps`` or ``max_episode_steps`` of the environment,
-    of what it wraps, or of what this holds, and in gymnasium's registration of these.
+    It is looked for as ``max_cycles``, ``max_steps`` or ``max_episode_steps`` of the environment
+    and of what it wraps, as ``max_cycles`` of what this holds, and in gymnasium's registration.
     """
-    for holder in _holders(env):
-        for name in _LIMITS:
+    for holder, names in _holders(env):
+        for name in names:
             limit = getattr(holder, name, None)
             if isinstance(limit, int) and limit >= 1 and not isinstance(limit, bool):
                 return int(limit)
@@ -156,10 +157,11 @@ def _quiet(name: str) -> contextlib.AbstractContextManager[None]:
     return mamujoco.quiet() if ours else contextlib.nullcontext()
 
 
-def _holders(env: Any) -> Iterator[Any]:
+def _holders(env: Any) -> Iterator[tuple[Any, tuple[str, ...]]]:
     inner = getattr(env, "unwrapped", env)
-    yield from (env, inner)
-    yield from (value for value in vars(inner).values() if hasattr(value, "step"))
+    yield from ((env, _LIMITS), (inner, _LIMITS))
+    held = getattr(inner, "__dict__", {}).values()
+    yield from ((value, _LIMITS[:1]) for value in held if hasattr(value, "step"))
 
 
 def _found(name: str) -> Any:

@@ -45,7 +45,7 @@ def _sight_of_state(parallel: Parallel) -> Sight | None:
         return None
     try:
         value = env.state()
-    except (NotImplementedError, AttributeError):  # what PettingZoo raises where there is none
+    except NotImplementedError:  # what PettingZoo raises where there is none
         return None
     if value is None:
         return None
