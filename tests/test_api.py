@@ -214,6 +214,7 @@ def test_settings_of_a_run_train_it_again(run: race.Run, tmp_path: Path) -> None
         ({"task": "probe/target", "seed": "1"}, "seed is '1'"),
         ({"task": "probe/target", "algo": "matd3", "race": {"population_size": 3}}, "no effect"),
         ({"task": "probe/target", "config": "nothing.toml"}, "cannot be read"),
+        ({"task": "probe/target", "log": ("paper",)}, "tensorboard.*not 'paper'"),
     ],
 )
 def test_mistakes_are_named(keywords: dict[str, Any], words: str, tmp_path: Path) -> None:

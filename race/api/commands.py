@@ -1,16 +1,18 @@
 """The commands of the shell as functions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from race.api.run import Directory, OnRow, Run, train_in
 from race.compilation import use_cache
 from race.config.files import Wanted, of_mapping, read_wanted
+from race.config.loggers import LoggerName
 from race.envs import make_task
 from race.envs.description import describe
 from race.errors import ConfigError
 from race.runs import directory as run_directory
+from race.runs.loggers.sending import choose, refuse_missing
 from race.teams.evaluation import Evaluation
 from race.teams.evaluation import evaluate as play
 from race.teams.export import Exported, format_of
@@ -29,6 +31,7 @@ def train(
     run_dir: Directory | None = None,
     config: Directory | Mapping[str, Any] | None = None,
     on_row: OnRow | None = None,
+    log: Sequence[LoggerName] | Any = (),
     progress: bool = True,
     **settings: Any,
 ) -> Run:
@@ -50,6 +53,7 @@ def train(
         on_row: told every row of metrics when it is written. If it returns False, the run is saved
             and left, to be gone on with by `Run.resume`; an error that it raises is raised here
             once the run is saved.
+        log: who else is told every row: ``tensorboard``, ``wandb``, ``mlflow``, ``trackio``.
         progress: whether to print a line per test, and a bar on a terminal.
         settings: ``algo``, ``base``, ``seed``, ``env_steps``, ``init_from``, ``preset``,
             ``ablation``, ``learner``, ``facmac``, ``race``, ``env``, ``evaluation``,
@@ -74,6 +78,11 @@ def train(
     asked = merged.config
     if not asked.task:
         raise ConfigError("Name a task: race.train('micro/2s3z'); `race list` shows all.")
+    loggers: list[Any] = [log] if isinstance(log, str) else list(log)
+    for logger in loggers:
+        if logger not in get_args(LoggerName):
+            raise ConfigError(f"log is of {', '.join(get_args(LoggerName))}, not {logger!r}.")
+    refuse_missing(loggers)
     use_cache(asked.compute)
     made = make_task(asked.task, asked.env)
     given = {k: v for k, v in file.settings.items() if k not in over.settings}
@@ -85,6 +94,7 @@ def train(
     begins_with = initial_teams(resolved, made)
     run_directory.create(path, resolved, describe(made) | tried(resolved.task, made))
     begins_with.keep_in(path)
+    choose(path, loggers)
     train_in(path, resolved, on_row, progress)
     return Run(path)
 
