@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from chosen import MAPS
 from numpy.typing import NDArray
 from reels import MANNERS, Reel, reel
 from test_opponent import watch
 
-from race.envs.micro import make, tournament
+from race.envs.micro import make, map_names, tournament
 from race.envs.micro.maps import parse_map
 from race.envs.micro.policies import POLICIES
 from race.envs.micro.scenario import APART, build
@@ -45,7 +44,14 @@ def backwards(r: Reel) -> tuple[int, int]:
     return int(back.sum()), int(goes.sum())
 
 
-@pytest.mark.parametrize("name", MAPS)
+CROWDED = {"2c_vs_64zg", "MMM2", "corridor", "bane_vs_bane"}
+"""Many small units, large ones, walls, bursts; the other maps are slow tests."""
+
+
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=[] if n in CROWDED else pytest.mark.slow) for n in map_names()],
+)
 def test_units_keep_apart_and_do_not_tremble(name: str) -> None:
     """Of pairs nearer than 1.2 of contact under 1% are nearer than 0.9, none than 0.5."""
     near = close = back = goes = 0
