@@ -1,4 +1,8 @@
-"""Environments of PettingZoo's family, whole; their packages are installed with `dev`."""
+"""Environments of PettingZoo's family, whole.
+
+Those of sisl and butterfly need `pip install 'pettingzoo[sisl,butterfly]'`, whose physics compiles
+from source where there is no wheel.
+"""
 
 import json
 import re
@@ -86,6 +90,7 @@ def test_mpe2(name: str, kwargs: str, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_sisl_and_butterfly(name: str) -> None:
+    pytest.importorskip("pymunk", reason="pip install 'pettingzoo[sisl,butterfly]'")
     config = EnvConfig(kwargs=OTHERS[name], largest_observation=200_000, state="observations")
     task = make_task(f"pettingzoo:{name}", config)
     trial = try_out(task)
