@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from race.config.cohort import CohortConfig
+from race.config.compute import ComputeConfig
 from race.config.loggers import LoggerName
 from race.config.settings import (
     CheckpointConfig,
@@ -64,6 +65,7 @@ class Reproduce:
     race: RaceConfig = field(default_factory=RaceConfig)
     evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
     checkpoint: CheckpointConfig = field(default_factory=CheckpointConfig)
+    compute: ComputeConfig = field(default_factory=ComputeConfig)
     cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
@@ -71,7 +73,8 @@ def main(arguments: list[str]) -> None:
     """Parses the arguments, plans, trains, draws."""
     chosen = tyro.cli(Reproduce, args=arguments, prog="race reproduce")
     from race.cli.fleet import check_jobs, run_all
-    from race.cli.sweep import create_runs, show_plan
+    from race.cli.planned import show_plan
+    from race.cli.sweep import create_runs
     from race.cli.worker import SHARED_ACCELERATOR
     from race.compilation import use_cache
     from race.config.seeds import parse_seeds
@@ -82,7 +85,7 @@ def main(arguments: list[str]) -> None:
         raise ConfigError("Say which figure: race reproduce {fig2,...,fig8,all}")
     check_jobs(chosen.jobs)
     figures = tuple(FIGURES) if "all" in chosen.figures else tuple(dict.fromkeys(chosen.figures))
-    groups = ("learner", "facmac", "race", "evaluation", "checkpoint")
+    groups = ("learner", "facmac", "race", "evaluation", "checkpoint", "compute")
     made = plan(
         figures,
         parse_seeds(chosen.seeds),
@@ -96,7 +99,6 @@ def main(arguments: list[str]) -> None:
     use_cache()
     if chosen.dry_run:
         show_plan(chosen.dir, made.runs, chosen.cohort)
-        print(_time(chosen.dir, made.runs))
         return
     failure = None
     if not chosen.draw_only:
@@ -136,28 +138,3 @@ def _draw(chosen: Reproduce, figures: tuple[str, ...], made: Any) -> None:
         absent = sum(any(p.figure == figure for p in made.seen[n]) for n in made.runs) - len(runs)
         if absent > 0:
             print(f"Missing: {figure}: {absent} runs are not begun.", file=sys.stderr)
-
-
-def _time(path: Path, runs: dict[str, Config]) -> str:
-    """How long it may take, from runs of the same task and method that have begun."""
-    from race.cli.worker import Watched
-
-    speeds: dict[tuple[str, str], list[float]] = {}
-    left: dict[tuple[str, str], float] = {}
-    for name, config in runs.items():
-        run, kind = Watched(path / name, config), (config.task, config.method)
-        run.look()
-        steps, seconds = run.row.get("env_steps", 0), run.row.get("wall_seconds", 0.0)
-        if steps and seconds:
-            speeds.setdefault(kind, []).append(steps / seconds)
-        short = 0 if run.ended else max(config.env_steps - steps, 0)
-        left[kind] = left.get(kind, 0.0) + short
-    known = {kind: left[kind] * len(s) / sum(s) for kind, s in speeds.items()}
-    unknown = sum(steps for kind, steps in left.items() if kind not in known)
-    said = []
-    if known:
-        hours = sum(known.values()) / 3600
-        said.append(f"{hours:,.1f} hours of one process, by the speed of runs that have begun")
-    if unknown:
-        said.append(f"{unknown:,.0f} steps of tasks and methods of which no run has begun yet")
-    return f"Time left: {'; '.join(said) or 'none'}."

@@ -59,6 +59,8 @@ def main(arguments: list[str]) -> None:
     runs = _planned(_read(chosen.file))
     path = chosen.run_dir or Path("runs") / chosen.file.stem
     if chosen.dry_run:
+        from race.cli.planned import show_plan
+
         show_plan(path, runs, chosen.cohort)
         return
     create_runs(path, runs, chosen.log)
@@ -139,47 +141,3 @@ def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -
             described[key] = describe(task) | tried(config.task, task)
         run_directory.create(path / name, config, described[key])
         choose(path / name, log)
-
-
-def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
-    """Lists runs, the process of each, and the memory of its replay buffer."""
-    from race.cli import streams
-    from race.cli.fleet import accelerators, crews
-    from race.cli.worker import Watched
-    from race.runs import directory as run_directory
-
-    console = streams.console()
-    watched = [Watched(path / name, config) for name, config in runs.items()]
-    groups = crews(watched, cohort.batching, cohort.width, accelerators())
-    longest = max(map(len, runs))
-    console.print(f"{'run':<{longest}}  process       steps   replay  state", soft_wrap=True)
-    sizes: dict[Any, int] = {}
-    for number, group in enumerate(groups, 1):
-        for run in group:
-            config = run.config
-            key = (config.task, config.env, config.env_steps, repr(config.learner), config.facmac)
-            if key not in sizes:
-                sizes[key] = _replay_bytes(config)
-            there = run_directory.RunDirectory(run.path).config.exists()
-            state = run.ended or ("begun" if there else "new")
-            steps, size = f"{config.env_steps:,}", f"{sizes[key] / 1e9:.2f} GB"
-            line = f"{run.name:<{longest}}  {number:>7}  {steps:>10}  {size:>7}  {state}"
-            console.print(line, soft_wrap=True, highlight=False)
-    cohorts = f" in {len(groups)} processes" if len(groups) < len(watched) else ""
-    console.print(
-        f"{len(watched)} runs{cohorts}, {sum(r.config.env_steps for r in watched):,} environment "
-        f"steps, in {path}. Nothing was run.",
-        soft_wrap=True,
-    )
-
-
-def _replay_bytes(config: Any) -> int:
-    """Memory of a run's replay buffer."""
-    import jax
-
-    from race.envs import make_task
-    from race.rollouts import rollouts_of
-
-    with rollouts_of(config, make_task(config.task, config.env)) as rollouts:
-        shapes = jax.eval_shape(lambda: rollouts.empty_replay(config))
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))

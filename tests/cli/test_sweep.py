@@ -35,6 +35,7 @@ def test_a_sweep_is_shown_run_and_gone_on_with(
     name = "probe-terminates-matd3-actor_learning_rate=0.0003-seed2"
     assert name in shown
     assert "4 runs, 360 environment steps" in shown
+    assert "Time left: 360 steps of tasks and methods of which no run has begun yet." in shown
     assert not Path("runs").exists()
     race("sweep grid.toml --cohort.batching vmap")
     assert "All 4 runs have finished" in capsys.readouterr().out
