@@ -6,8 +6,12 @@
 # The machine needs Python 3.11 to 3.13 with JAX for its card; what else is missing (mujoco,
 # gymnasium, gymnasium-robotics, tyro and what they need) is taken from a folder of wheels. All
 # other options are those of scripts/gpu_evidence.py, which tells of the stages: --help.
-# To fetch the wheels, on a machine with network and Python 3.12:
-#   pip download --only-binary=:all: --dest wheels mujoco gymnasium gymnasium-robotics tyro ...
+# To fetch the wheels (40 MB), on a machine with network, for Python 3.12 there:
+#   pip download --no-deps --only-binary=:all: --python-version 3.12 --dest wheels \
+#     --platform manylinux_2_28_x86_64 --platform manylinux_2_27_x86_64 \
+#     --platform manylinux2014_x86_64 mujoco mujoco-core glfw pyopengl etils gymnasium \
+#     farama-notifications gymnasium-robotics pettingzoo tyro docstring-parser typeguard
+# What it lacks of videos (imageio-ffmpeg) is not needed.
 set -euo pipefail
 repository="$(cd "$(dirname "$0")/.." && pwd)"
 python="$(command -v python3 || command -v python)"
