@@ -2,22 +2,20 @@
 
 Axes and their letters, used in every shape of the project:
 
-==========  =====================================================================
-letter      axis
-==========  =====================================================================
-``B``       samples of a batch
-``N``       agents of a team
-``O``       entries of one agent's observation, padded to the largest agent
-``A``       entries of one agent's action, padded to the largest agent
-``U``       entries of the joint action, all agents, no padding
-``S``       entries of the global state
-``H``       units of an observation embedding z
-``P``       teams of the population
-``T``       teams that act: the population, then the MARL team
-``K``       critics of an ensemble (2 for MATD3, 1 for MADDPG and FACMAC)
-``L``       moments of an episode: before each of its steps, and after the last
-``R``       rows of a minibatch of episodes, each of one or more of them
-==========  =====================================================================
+| letter | axis |
+|---|---|
+| `B` | samples of a batch |
+| `N` | agents of a team |
+| `O` | entries of one agent's observation, padded to the largest agent |
+| `A` | entries of one agent's action, padded to the largest agent |
+| `U` | entries of the joint action, all agents, no padding |
+| `S` | entries of the global state |
+| `H` | units of an observation embedding z |
+| `P` | teams of the population |
+| `T` | teams that act: the population, then the MARL team |
+| `K` | critics of an ensemble (2 for MATD3, 1 for MADDPG and FACMAC) |
+| `L` | moments of an episode: before each of its steps, and after the last |
+| `R` | rows of a minibatch of episodes, each of one or more of them |
 """
 
 import dataclasses

@@ -1,10 +1,17 @@
 """What a release says about itself, in every place that says it."""
 
+import os
 import re
+import shutil
+import subprocess
+import sys
 import tomllib
+import venv
+import zipfile
 from pathlib import Path
 from typing import Any
 
+import pytest
 import yaml
 
 import race
@@ -70,3 +77,41 @@ def test_nothing_is_published_that_was_not_checked_and_attested() -> None:
     writers = {name for name in jobs if "id-token" in jobs[name].get("permissions", {})}
     assert writers == {"attest", "publish"}
     assert jobs["publish"]["environment"] == "release"
+
+
+@pytest.mark.slow
+def test_the_wheel_trains_in_an_empty_environment_far_from_the_checkout(tmp_path: Path) -> None:
+    """Built from a copy of what is under version control, and installed with what it asks for."""
+    env = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "XLA_FLAGS")}
+
+    def call(*words: str | Path, folder: Path = tmp_path) -> str:
+        done = subprocess.run(words, cwd=folder, env=env, capture_output=True, text=True)
+        assert done.returncode == 0, f"{words}\n{done.stdout}\n{done.stderr}"
+        return done.stdout
+
+    source, wheels, away = (tmp_path / name for name in ("source", "wheels", "away"))
+    for name in call("git", "ls-files", folder=ROOT).splitlines():
+        if (ROOT / name).exists():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(ROOT / name, source / name)
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet")
+    call(*pip, "wheel", "--no-deps", "--wheel-dir", wheels, source)
+    (wheel,) = wheels.glob("*.whl")
+    with zipfile.ZipFile(wheel) as content:
+        packed = set(content.namelist())
+    for name in call("git", "ls-files", "race", folder=ROOT).splitlines():
+        assert name in packed or not (ROOT / name).exists(), f"{name} is not in the wheel"
+    assert not [name for name in packed if name.startswith(("tests/", "docs/", "scripts/"))]
+
+    venv.create(tmp_path / "empty", with_pip=True)
+    python = tmp_path / "empty/bin/python"
+    call(python, "-m", "pip", "--disable-pip-version-check", "--quiet", "install", wheel)
+    away.mkdir()
+    where = call(python, "-c", "import race; print(race.__file__)", folder=away)
+    assert where.startswith(str(tmp_path / "empty"))
+    script = tmp_path / "empty/bin/race"
+    little = "--env-steps 700 --learner.random-steps 600 --learner.hidden-sizes 10 8"
+    call(script, "train", "probe/target", *little.split(), "--run-dir", "run", folder=away)
+    assert (away / "run/DONE").exists()
+    assert "episodes" in call(script, "evaluate", "run", "--episodes", "2", folder=away)
+    assert "micro/MMM2" in call(script, "list", folder=away)

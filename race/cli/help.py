@@ -50,14 +50,16 @@ def show(command: Any, arguments: Sequence[str]) -> None:
     asked = _asked(command, words)
     everything = "--help-all" in arguments
     lines = [*_head(command, asked), ""]
-    first = list(_options(command, "", asked))
+    first = list(options_of(command, "", asked))
     first.sort(key=lambda option: (*_FIRST, option.name).index(option.name))
     lines += _listed(first)
     unread = frozenset() if everything or asked is None else _idle(asked)
     for field in dataclasses.fields(command):
         if not dataclasses.is_dataclass(field.type):
             continue
-        options = [o for o in _options(field.type, f"{field.name}.", asked) if o.name not in unread]
+        options = [
+            o for o in options_of(field.type, f"{field.name}.", asked) if o.name not in unread
+        ]
         about = inspect.cleandoc(field.type.__doc__ or "").partition("\n")[0]
         if not options:
             continue
@@ -115,7 +117,14 @@ def _idle(asked: Any) -> frozenset[str]:
     )
 
 
-def _options(group: Any, prefix: str, asked: Any) -> Iterator[Option]:
+def options_of(group: Any, prefix: str = "", asked: Any = None) -> Iterator[Option]:
+    """The options of a dataclass of settings, whose own groups are left out.
+
+    Args:
+        group: the dataclass.
+        prefix: of the options' names, such as ``env.``.
+        asked: what was asked for, whose preset then gives defaults; None: the usual ones.
+    """
     texts = _texts(group)
     defaults = group() if prefix else None
     if prefix == "learner." and asked is not None:
