@@ -55,7 +55,8 @@ def small(words: list[str]) -> list[str]:
     if words[0] == "train" and (
         words[1] == "--config" or not isinstance(make_task(words[1]), DiscreteTask)
     ):
-        options += shlex.split(CONTINUOUS)
+        # EA learns nothing by gradients.
+        options += shlex.split("--learner.hidden-sizes 10 8" if "ea" in words else CONTINUOUS)
     return [*words, *options]
 
 
