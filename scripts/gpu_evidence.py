@@ -30,7 +30,7 @@ SHARE = {"agreement": 0.15, "resume": 0.1, "bench": 0.2}
 """Of all the time, the most that a stage may take; the rest is for evidence."""
 PROBES = (
     ("probe/target", "race"),
-    ("probe/coordination", "race"),
+    ("probe/matching", "race"),
     ("probe/target", "facmac"),
 )
 """RACE holds its base within it."""
@@ -175,7 +175,7 @@ def agreement(evidence: Evidence, seconds: float) -> dict[str, Any]:
     due = time.monotonic() + seconds
     for task, algo in PROBES:
         name = f"{task} {algo}"
-        small = SMALL if task == "probe/target" else ()
+        small = SMALL if task == "probe/target" else ()  # the other has discrete actions
         asked = (task, "--algo", algo, "--env-steps", PROBE_STEPS, *small)
         runs = [evidence.work / f"{name.replace('/', '-')} on {p}" for p in ("cpu", "device")]
         environments: tuple[dict[str, str], ...] = ({"JAX_PLATFORMS": "cpu"}, {})
@@ -185,7 +185,8 @@ def agreement(evidence: Evidence, seconds: float) -> dict[str, Any]:
         ]
         codes = [evidence.wait(one, due - time.monotonic())[0] for one in both]
         if any(codes):
-            return found | {"stopped": name}
+            found[name] = {"exit_statuses": codes}
+            continue
         rows = [evidence.rows(run) for run in runs]
         first, last = differences(*rows)
         found[name] = {"first_row_with_losses": first, "all_rows": last}
