@@ -18,6 +18,11 @@ def cache_directory() -> Path:
     return (Path(base) if base else Path.home() / ".cache") / "race" / "jax"
 
 
+def cores() -> list[int]:
+    """The processor's cores that this process may run on; none where the system does not say."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+
+
 def check_backend() -> None:
     """Looks whether JAX can compute at all.
 

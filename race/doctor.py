@@ -14,7 +14,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from race import __version__
-from race.compilation import check_backend
+from race.compilation import check_backend, cores
 from race.runs.metadata import DISTRIBUTION
 from race.viewing.rendering import PACKAGES, choose_renderer
 
@@ -131,10 +131,10 @@ def _video() -> Finding:
 
 
 def _machine() -> Finding:
-    cores = len(os.sched_getaffinity(0))
+    count = len(cores()) or os.cpu_count()
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     status: Status = "ok" if memory >= 2 else "warning"
-    return Finding("machine", status, f"{cores} cores, {memory:.0f} GiB of memory")
+    return Finding("machine", status, f"{count} cores, {memory:.0f} GiB of memory")
 
 
 def _cache(cache: Path) -> Finding:

@@ -1,6 +1,5 @@
 """The script for a machine with a GPU: what it compares, and a minute of it on a processor."""
 
-import importlib.util
 import json
 import os
 import subprocess
@@ -9,19 +8,14 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from loaded_scripts import SCRIPTS, loaded
 
-SCRIPTS = Path(__file__).parent.parent / "scripts"
 FILES = {"log.txt", "report.json", "bench.json", "evidence.jsonl.gz", "doctor.txt"}
 
 
 @pytest.fixture(scope="module")
 def script() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("gpu_evidence", SCRIPTS / "gpu_evidence.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return loaded("gpu_evidence")
 
 
 def test_rows_are_compared_by_their_losses_relative_to_their_size(script: ModuleType) -> None:

@@ -1,7 +1,6 @@
 """The documents and their site: links lead somewhere, no page and no setting is left out."""
 
 import dataclasses
-import importlib.util
 import os
 import re
 import subprocess
@@ -11,6 +10,7 @@ from typing import Any, get_type_hints
 
 import pytest
 import yaml
+from loaded_scripts import loaded
 
 import race
 from race.config.settings import Config
@@ -26,12 +26,7 @@ DOCUMENTS = [
 @pytest.fixture(scope="module")
 def site() -> Any:
     """The hook that makes pages of the code."""
-    found = importlib.util.spec_from_file_location("docs_site", ROOT / "scripts/docs_site.py")
-    assert found is not None
-    assert found.loader is not None
-    module = importlib.util.module_from_spec(found)
-    found.loader.exec_module(module)
-    return module
+    return loaded("docs_site")
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,8 @@ from race.envs import make_task
 from race.envs.description import describe
 from race.errors import ConfigError
 from race.runs import directory as run_directory
-from race.runs.loggers.sending import choose, refuse_missing
+from race.runs.loggers.sending import refuse_missing
+from race.teams.creating import create_run
 from race.teams.evaluation import Evaluation
 from race.teams.evaluation import evaluate as play
 from race.teams.export import Exported, format_of
@@ -92,9 +93,8 @@ def train(
     path = usual_directory(resolved) if run_dir is None else Path(run_dir)
     run_directory.refuse_occupied(path)
     begins_with = initial_teams(resolved, made)
-    run_directory.create(path, resolved, describe(made) | tried(resolved.task, made))
-    begins_with.keep_in(path)
-    choose(path, loggers)
+    described = describe(made) | tried(resolved.task, made)
+    create_run(path, resolved, described, begins_with, loggers)
     train_in(path, resolved, on_row, progress)
     return Run(path)
 

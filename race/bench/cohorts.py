@@ -14,6 +14,7 @@ import numpy as np
 from race import programs
 from race.bench.measurement import Measurement, Subject, interleaved_best, seconds
 from race.bench.update import Updates, setting, steps_per_call
+from race.compilation import cores
 from race.envs import make_continuous_task
 from race.programs import cohort
 from race.rollouts.pool import EnvPool
@@ -54,7 +55,7 @@ def subjects() -> list[Subject]:
 def _measure_turns(name: str) -> list[Measurement]:
     """Time of a step of each of four runs over that of a single run, in one process."""
     runs = [Updates(setting(TASK, 128), TRANSITIONS) for _ in range(TURNS)]
-    steps = steps_per_call(runs[0]) // 2 * 2
+    steps = steps_per_call(runs[0])
 
     def in_turns() -> Any:
         return [run(steps) for run in runs]
@@ -65,8 +66,8 @@ def _measure_turns(name: str) -> list[Measurement]:
 
 def _measure_side_by_side(name: str) -> list[Measurement]:
     """Time of two processes of one core each, at once, over that of one of them alone."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    if len(cores) < 2:
+    usable = cores()
+    if len(usable) < 2:
         return []
 
     def process(core: int) -> "subprocess.Popen[str]":
@@ -87,7 +88,7 @@ def _measure_side_by_side(name: str) -> list[Measurement]:
             one.stdin.flush()
         return max(float(_line(one)) for one in asked)
 
-    first, second = process(cores[0]), process(cores[1])
+    first, second = process(usable[0]), process(usable[1])
     with first, second:
         try:
             for one in (first, second):
@@ -130,7 +131,7 @@ def _measure_pool(name: str) -> list[Measurement]:
     with EnvPool(task, ENVS) as pool:
         pool.reset({team: team for team in range(ENVS)})
         actions = dict.fromkeys(range(ENVS), action)
-        workers = min(len(os.sched_getaffinity(0)), ENVS) if pool.processes else 1
+        workers = min(len(cores()), ENVS) if pool.processes else 1
         raw = task.make(None)
         raw.reset(seed=0)
 

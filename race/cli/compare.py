@@ -50,8 +50,8 @@ def main(arguments: list[str]) -> None:
     """Parses the arguments, compares, prints and writes."""
     chosen = tyro.cli(Compare, args=arguments, prog="race compare")
     from race.errors import RaceError, RunDirectoryError
+    from race.runs.aside import written_aside
     from race.runs.results import load
-    from race.viewing.aside import written_aside
     from race.viewing.comparison import compare
     from race.viewing.scores import scores_of
     from race.viewing.tables import SUFFIXES, written

@@ -20,6 +20,7 @@ from rich.table import Table
 
 from race.cli import streams
 from race.cli.worker import INTERRUPTED, Watched, Worker
+from race.compilation import cores
 from race.config.cohort import Batching, CohortConfig
 from race.config.presets import resolve
 from race.errors import ConfigError, RunDirectoryError, command
@@ -158,12 +159,12 @@ def run_all(
     devices = accelerators()
     groups = crews(runs, cohort.batching, cohort.width, devices)
     workers = [Worker(group, cohort.batching) for group in groups]
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    jobs = min(jobs or devices or max(len(cores), 1), len(workers))
-    pinned = jobs > 1 and cores and not devices
+    usable = cores()
+    jobs = min(jobs or devices or max(len(usable), 1), len(workers))
+    pinned = jobs > 1 and usable and not devices
     named = _names_of(devices)
     free: list[tuple[int | None, str | None]] = [
-        (cores[k % len(cores)] if pinned else None, named[k % devices] if devices else None)
+        (usable[k % len(usable)] if pinned else None, named[k % devices] if devices else None)
         for k in range(jobs)
     ]
     with (

@@ -3,15 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+from race.cli.worker import Watched
 from race.config.cohort import CohortConfig
-from race.config.settings import Config
 
 
 def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
     """Lists runs, the process of each, its replay buffer's memory, and the time that is left."""
     from race.cli import streams
     from race.cli.fleet import accelerators, crews
-    from race.cli.worker import Watched
     from race.runs import directory as run_directory
 
     console = streams.console()
@@ -37,7 +36,7 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
         f"steps, in {path}. Nothing was run.",
         soft_wrap=True,
     )
-    console.print(time_left(path, runs), soft_wrap=True)
+    console.print(_time_left(watched), soft_wrap=True)
 
 
 def _replay_bytes(config: Any) -> int:
@@ -52,14 +51,13 @@ def _replay_bytes(config: Any) -> int:
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
 
 
-def time_left(path: Path, runs: dict[str, Config]) -> str:
+def _time_left(runs: list[Watched]) -> str:
     """How long it may take, from runs of the same task and method that have begun here."""
-    from race.cli.worker import Watched
-
     speeds: dict[tuple[str, str], list[float]] = {}
     left: dict[tuple[str, str], float] = {}
-    for name, config in runs.items():
-        run, kind = Watched(path / name, config), (config.task, config.method)
+    for run in runs:
+        config = run.config
+        kind = config.task, config.method
         run.look()
         steps, seconds = run.row.get("env_steps", 0), run.row.get("wall_seconds", 0.0)
         if steps and seconds:

@@ -40,8 +40,8 @@ def main(arguments: list[str]) -> None:
     """Parses the arguments, writes or serves the page."""
     chosen = tyro.cli(Report, args=arguments, prog="race report")
     from race.errors import RaceError, RunDirectoryError
+    from race.runs.aside import written_aside
     from race.runs.results import load
-    from race.viewing.aside import written_aside
     from race.viewing.report.content import content_of
     from race.viewing.report.page import page_of
     from race.viewing.report.serving import server

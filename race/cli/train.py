@@ -108,7 +108,8 @@ def main(arguments: list[str]) -> None:
     from race.envs import make_task
     from race.envs.description import describe
     from race.runs import directory as run_directory
-    from race.runs.loggers.sending import choose, refuse_missing
+    from race.runs.loggers.sending import refuse_missing
+    from race.teams.creating import create_run
     from race.teams.initial import initial_teams
     from race.training.asking import name_of, settled_with_file, usual_directory
 
@@ -125,9 +126,8 @@ def main(arguments: list[str]) -> None:
         path = chosen.run_dir or usual_directory(config)
         run_directory.refuse_occupied(path)
         begins_with = initial_teams(config, task)
-        run_directory.create(path, config, describe(task) | tried(asked.task, task))
-        begins_with.keep_in(path)
-        choose(path, chosen.log)
+        described = describe(task) | tried(asked.task, task)
+        create_run(path, config, described, begins_with, chosen.log)
         run(path, config)
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
@@ -138,11 +138,9 @@ def main(arguments: list[str]) -> None:
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """`race.training.asking.tried`, with a word on what takes the time."""
     from race.cli import streams
-    from race.envs import pettingzoo
-    from race.envs.own import is_own
     from race.training import asking
 
-    if not is_own(task_id) and not task_id.startswith(pettingzoo.PREFIX):
+    if not asking.is_tried(task_id):
         return asking.tried(task_id, task)
     with streams.console(stderr=True).status("trying the environment"):
         return asking.tried(task_id, task)
@@ -153,8 +151,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     from race.cli.fleet import check_jobs
     from race.config.seeds import parse_seeds
     from race.envs.description import describe
-    from race.runs import directory as run_directory
-    from race.runs.loggers.sending import choose
+    from race.teams.creating import create_run
     from race.teams.initial import initial_teams
 
     seeds = parse_seeds(str(chosen.seeds))
@@ -173,9 +170,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     begins_with = initial_teams(config, task)
     described = describe(task) | tried(config.task, task)
     for place, one in zip(places, configs, strict=True):
-        run_directory.create(place, one, described)
-        begins_with.keep_in(place)
-        choose(place, chosen.log)
+        create_run(place, one, described, begins_with, chosen.log)
 
 
 def _parse(arguments: list[str]) -> Train:

@@ -289,7 +289,7 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
 def _is_object(text: str) -> bool:
     try:
         return isinstance(json.loads(text), dict)
-    except ValueError:
+    except (ValueError, RecursionError):
         return False
 
 

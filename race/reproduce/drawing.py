@@ -13,10 +13,10 @@ from matplotlib.figure import Figure as Canvas
 from race.reproduce import paper
 from race.reproduce.figures import FIGURES, variants
 from race.reproduce.planning import Place
+from race.runs.aside import written_aside
 from race.runs.recorded import Recorded
 from race.statistics.intervals import bounds_of, mean_estimate
 from race.viewing import curves as chosen
-from race.viewing.aside import written_aside
 from race.viewing.curves import Curve, aggregate
 from race.viewing.plotting import draw, frame
 

@@ -9,6 +9,7 @@ from typing import Any, Final, final
 
 import numpy as np
 
+from race.compilation import cores
 from race.envs.checked import CheckedEnv
 from race.envs.contract import Seen, Step
 from race.envs.worker import EnvProcess, Request
@@ -247,9 +248,7 @@ def _close(close: Callable[[], None]) -> list[TaskError]:
 
 
 def _cores() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(cores()) or os.cpu_count() or 1
 
 
 def _processes_pay(task: Task, size: int) -> bool:

@@ -4,15 +4,14 @@ Before a file is put in place it is read back as its user will, and must act as 
 random observations and on those of an episode; else it is refused.
 """
 
-import contextlib
 import hashlib
-import os
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 from race import ALGORITHM_VERSION, __version__
 from race.errors import ConfigError, ExportError
 from race.runs import metrics
+from race.runs.aside import written_aside
 from race.runs.directory import RunDirectory
 from race.teams.checking import RANDOM, TOLERANCE, Moments, checked, shown_to
 from race.teams.formats import (
@@ -175,13 +174,5 @@ def _put(path: Path, content: bytes) -> None:
     Raises:
         ExportError: if it cannot be written.
     """
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    with written_aside(path, ExportError) as temporary:
         temporary.write_bytes(content)
-        temporary.rename(path)
-    except OSError as error:
-        raise ExportError(f"{path} cannot be written: {error}.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()

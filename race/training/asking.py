@@ -95,20 +95,24 @@ def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
     }
 
 
+def is_tried(task_id: str) -> bool:
+    """Whether an environment of that name is looked at before it is trained on; others repeat."""
+    return is_own(task_id) or task_id.startswith(pettingzoo.PREFIX)
+
+
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """What a first look at an environment of the user's own says; others repeat.
 
     Raises:
         TaskError: if it fails, or breaks the contract.
     """
-    foreign = task_id.startswith(pettingzoo.PREFIX)
-    if not is_own(task_id) and not foreign:
+    if not is_tried(task_id):
         return {"repeats": True}
     trial = try_out(task)
     if trial.note:
         say(trial.note)
     found: dict[str, Any] = {"repeats": trial.repeats, "conflict": trial.conflict}
-    if foreign:
+    if task_id.startswith(pettingzoo.PREFIX):
         found["packages"] = pettingzoo.packages(task_id.removeprefix(pettingzoo.PREFIX))
     return found
 

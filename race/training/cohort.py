@@ -13,11 +13,11 @@ import jax
 from race.config.cohort import Batching
 from race.config.settings import Config
 from race.config.shape import shape_of
-from race.errors import DivergenceError, RunDirectoryError
+from race.errors import DivergenceError
 from race.training.generation import evolve, inject, noted, owed, test, to_play
 from race.training.learning import learn, learn_together
 from race.training.run import Run
-from race.training.run_state import RunState, test_due
+from race.training.run_state import Outcome, RunState, test_due
 
 
 def kind_of(config: Config) -> tuple[Any, ...]:
@@ -32,10 +32,6 @@ def kind_of(config: Config) -> tuple[Any, ...]:
         config.facmac.replay_precision,
         config.compute,
     )
-
-
-Outcome = RunState | DivergenceError | RunDirectoryError
-"""What became of a run in a piece: its state, or what ended it."""
 
 
 class _Piece(IntEnum):
@@ -68,7 +64,7 @@ def advance(
         as_one: whether all are one program.
 
     Returns:
-        The states, or how a run diverged or why its rows could not be written.
+        The states, or how a run diverged or why its directory could not be written.
 
     Raises:
         TaskError: if an environment fails, or hands over what it may not.
@@ -80,7 +76,7 @@ def advance(
         return _roll_out(runs, states, chosen)  # 3-6, 9
     if piece == _Piece.LEARN:  # 8, 10, 13
         if as_one:
-            return list(learn_together(runs, states, chosen))
+            return learn_together(runs, states, chosen)
         return [
             learn(run, state) if here else state
             for run, state, here in zip(runs, states, chosen, strict=True)

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from race import programs
 from race.algorithms.base import Tested
 from race.config.settings import Config
-from race.errors import DivergenceError, RunDirectoryError
+from race.errors import CheckpointError, DivergenceError, RunDirectoryError
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
-from race.training.run_state import Progress, RunState
+from race.training.run_state import Outcome, Progress, RunState
 
 
 def warm_up(run: Run, state: RunState) -> RunState:
@@ -120,7 +120,7 @@ def checked(state: RunState, before: Progress) -> RunState | DivergenceError:
     return state
 
 
-def inject(run: Run, state: RunState) -> RunState | RunDirectoryError:
+def inject(run: Run, state: RunState) -> Outcome:
     """Line 11: the MARL team enters the population; the generation is over and has its row.
 
     Returns:
@@ -144,11 +144,11 @@ def inject(run: Run, state: RunState) -> RunState | RunDirectoryError:
     return state._replace(algorithm=algorithm, losses=losses, progress=progress)
 
 
-def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState | RunDirectoryError]:
-    """Plays the test episodes of some runs and writes their rows.
+def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[Outcome]:
+    """Plays the test episodes of some runs, writes their rows and keeps the best teams.
 
     Returns:
-        Of each the state, or why its row could not be written.
+        Of each the state, or why its directory could not be written.
     """
     groups: list[list[Trial]] = []
     teams: list[tuple[Tested, ...]] = []
@@ -168,7 +168,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState | Run
     ]
     # Of several runs failures are not told apart: each that took part counts all.
     repeated = rollouts.repeated - before
-    after: list[RunState | RunDirectoryError] = []
+    after: list[Outcome] = []
     for run, state, tested, found in zip(runs, states, teams, scores, strict=True):
         progress = state.progress
         progress = stamped(
@@ -179,7 +179,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[RunState | Run
         try:
             run.metrics.write(row)
             keep_best(run, tested, found, progress)
-        except RunDirectoryError as error:
+        except (RunDirectoryError, CheckpointError) as error:
             after.append(error)
             continue
         run.report("evaluation", progress, row)

@@ -18,7 +18,7 @@ from race.replay.buffer import Layout
 from race.replay.packing import layouts, widened
 from race.training.generation import checked, owed
 from race.training.run import Run
-from race.training.run_state import RunState
+from race.training.run_state import Outcome, RunState
 
 CHUNK = 100
 """Gradient steps between two looks at the clock, the progress bar and Ctrl-C."""
@@ -51,7 +51,7 @@ def learn(run: Run, state: RunState) -> RunState | DivergenceError:
 
 def learn_together(
     runs: Sequence[Run], states: Sequence[RunState], active: Sequence[bool]
-) -> list[RunState | DivergenceError]:
+) -> list[Outcome]:
     """The same of several runs in one program; some may have nothing to do."""
     keys = [_key(run) for run in runs]
     firsts = np.array([state.progress.gradient_steps for state in states], np.int32)

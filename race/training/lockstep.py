@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from race.errors import DivergenceError, RaceError, RunDirectoryError, TaskError, command
+from race.errors import DivergenceError, RaceError, TaskError, command
 from race.runs import checkpoints
 from race.runs import directory as run_directory
 from race.training.cohort import advance
@@ -103,7 +103,7 @@ def _advance(members: list[Member], as_one: bool, results: Results, alone: bool)
     for member, outcome in zip(list(members), after, strict=True):
         if isinstance(outcome, DivergenceError):
             _dismiss(member, outcome, members, results, alone)
-        elif isinstance(outcome, RunDirectoryError):
+        elif isinstance(outcome, RaceError):
             _leave_out(member, outcome, members, results, alone)
         else:
             member.state = outcome

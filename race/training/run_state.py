@@ -9,6 +9,7 @@ from race.algorithms.base import Losses
 from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config
 from race.config.shape import shape_of
+from race.errors import CheckpointError, DivergenceError, RunDirectoryError
 from race.networks.optimization import copy
 from race.programs import empty_losses, start
 from race.randomness import Purpose, root_key
@@ -99,6 +100,10 @@ class RunState(NamedTuple):
     replay: Replay
     progress: Progress
     hyper: Hyper
+
+
+Outcome = RunState | DivergenceError | RunDirectoryError | CheckpointError
+"""What became of a run in a piece of a generation: its state, or what ended it."""
 
 
 def statics(config: Config, spec: Spec, algorithm: Algorithm) -> dict[str, Any]:

@@ -11,11 +11,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from race.errors import RaceError
+from race.runs.aside import written_aside
 from race.runs.recorded import Recorded
 from race.runs.results import load
 from race.statistics.intervals import LEAST_SEEDS_OF_A_BAND, bounds_of
 from race.viewing import curves as chosen
-from race.viewing.aside import written_aside
 from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ended_early
 
 FORMATS = (".png", ".svg", ".pdf")

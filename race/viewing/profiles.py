@@ -6,8 +6,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from race.errors import RaceError
+from race.runs.aside import written_aside
 from race.statistics.intervals import LEAST_SEEDS_OF_A_BAND
-from race.viewing.aside import written_aside
 from race.viewing.comparison import Comparison
 from race.viewing.plotting import FORMATS, colours_of
 

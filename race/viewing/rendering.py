@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from race.envs.checked import CheckedEnv
 from race.envs.contract import in_units
 from race.errors import RenderError, TaskError
+from race.runs.aside import written_aside
 from race.types import Task
 
 Backend = Literal["egl", "osmesa", "glfw", "sketch"]
@@ -263,21 +264,12 @@ def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> 
         options = {"duration": 1000 / fps, "loop": 0}
     else:
         raise RenderError(f"{path} is no video: the name must end with .mp4 or .gif.")
-    temporary = path.with_name(f".tmp-{os.getpid()}-{path.name}")
     count = 0
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with warnings.catch_warnings():
-            # The child becomes ffmpeg at once and touches nothing of JAX.
-            warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
-            with imageio.get_writer(temporary, **options) as writer:
-                for frame in frames:
-                    writer.append_data(frame)
-                    count += 1
-        temporary.rename(path)
-    except OSError as error:
-        raise RenderError(f"{path} cannot be written: {error}.") from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
+    with written_aside(path, RenderError) as temporary, warnings.catch_warnings():
+        # The child becomes ffmpeg at once and touches nothing of JAX.
+        warnings.filterwarnings("ignore", message=r"os\.fork\(\) was called")
+        with imageio.get_writer(temporary, **options) as writer:
+            for frame in frames:
+                writer.append_data(frame)
+                count += 1
     return count

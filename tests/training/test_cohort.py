@@ -13,9 +13,15 @@ from test_trainer_discrete import small as discrete
 from whole_runs import KilledError, rows, run
 
 from race.config.cohort import Batching
-from race.config.settings import Config
-from race.errors import ConfigError, DivergenceError, RaceError, RunDirectoryError
-from race.runs import checkpoints
+from race.config.settings import CheckpointConfig, Config
+from race.errors import (
+    CheckpointError,
+    ConfigError,
+    DivergenceError,
+    RaceError,
+    RunDirectoryError,
+)
+from race.runs import checkpoints, team_files
 from race.runs import directory as run_directory
 from race.runs.metrics import MetricsWriter
 from race.training import learning, lockstep
@@ -234,6 +240,26 @@ def test_a_run_whose_rows_cannot_be_written_stops_nobody(
         assert run_directory.is_finished(tmp_path / f"seed{config.seed}")
     with pytest.raises(RunDirectoryError, match="full"):  # the only run ends with the error
         train_all(tmp_path / "alone", made[1:2], "map")
+
+
+def test_a_run_whose_best_team_cannot_be_kept_stops_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    keeping = CheckpointConfig(keep_best=1)
+    made = [dataclasses.replace(config, checkpoint=keeping) for config in configs("matd3")[:2]]
+    sound = team_files.write
+
+    def write(path: Path, *told: Any) -> None:
+        if "seed2" in path.parts:
+            raise CheckpointError("the disk is full")
+        sound(path, *told)
+
+    monkeypatch.setattr(team_files, "write", write)
+    results = train_all(tmp_path, made, "map")
+    assert isinstance(results[0], Progress)
+    assert run_directory.is_finished(tmp_path / "seed1")
+    assert isinstance(results[1], CheckpointError)
+    assert not run_directory.is_finished(tmp_path / "seed2")
 
 
 def test_runs_that_are_not_of_one_kind_are_refused(tmp_path: Path) -> None:
