@@ -106,6 +106,7 @@ def test_runs_that_differ_in_numbers_and_seed_share_their_programs(
     tmp_path: Path, make: Callable[..., Config], algo: str, others: dict[str, Any]
 ) -> None:
     programs.TRACES.clear()
+    programs.learn.clear_cache()  # of what other tests of this process have compiled
     run(tmp_path / "one", make(algo))
     first = dict(programs.TRACES)
     assert first["learn"] >= 1

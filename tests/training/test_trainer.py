@@ -196,8 +196,8 @@ def test_the_episode_limit_holds_where_the_environment_has_none(
 
 def test_each_program_is_compiled_once(tmp_path: Path) -> None:
     programs.TRACES.clear()
-    programs.store.clear_cache()
-    # Networks of their own sizes, so that no other test has compiled the rest.
+    for program in ("start", "store", "act", "evolve", "learn", "inject"):
+        getattr(programs, program).clear_cache()  # of what other tests have compiled
     learner = LearnerConfig(hidden_sizes=(11, 9), batch_size=8, random_steps=20)
     run(tmp_path, small("probe/target", learner=learner, env_steps=60))
     counts = dict(programs.TRACES)

@@ -282,6 +282,8 @@ def test_learning_is_traced_once_per_shape_and_sees_whole_episodes(
             assert (time >= 0).sum() == (lengths[drawn] + 1).sum()
         return real(state, sums, replay, *others, layouts=layouts, **statics)
 
+    for program in ("start", "store", "draw", "learn"):
+        getattr(programs, program).clear_cache()  # of what other tests have compiled
     monkeypatch.setattr(programs, "learn", spy)
     monkeypatch.setattr(learning, "EPISODES_CHUNK", 1)
     programs.TRACES.clear()
