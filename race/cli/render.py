@@ -33,7 +33,7 @@ class Render:
             help_behavior_hint="(default: team.mp4 of a run, battle.gif of a battle)",
         ),
     ] = None
-    """The video: .mp4, battles in 1920 x 1080, or .gif, in 960 x 540."""
+    """The video: .mp4, in 1280 x 720, battles in 1920 x 1080; or a .gif of half the size."""
     team: Annotated[
         TeamName | None,
         tyro.conf.arg(metavar="{marl,champion,selected}", help_behavior_hint="(default: selected)"),
@@ -93,7 +93,8 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
         recording = play(played, POLICIES[policy], chosen.seed, most_steps)
-    _write(of_battle(played, recording, out), f"{policy} policy", out, console)
+    drawn = of_battle(played, recording, policy, out.suffix.lower() == ".gif")
+    _write(drawn, f"{policy} policy", out, console)
 
 
 def _render_run(chosen: Render, out: Path) -> None:
@@ -117,7 +118,7 @@ def _render_run(chosen: Render, out: Path) -> None:
             renderer = choose_renderer()
         console.print(f"Drawing with: {renderer.reason}", soft_wrap=True)
     from race.teams.trained import load_trained
-    from race.viewing.filming import film
+    from race.viewing.filming import LABELS, film
 
     use_cache(config.compute)
     team = chosen.team or "selected"
@@ -125,8 +126,7 @@ def _render_run(chosen: Render, out: Path) -> None:
         trained = load_trained(chosen.what, chosen.checkpoint)
     with console.status("playing the episode"):
         drawn = film(trained, team, chosen.seed, chosen.seconds, out, renderer)
-    labels = {"marl": "MARL team", "champion": "champion"}
-    _write(drawn, labels[trained.resolve(team)], out, console)
+    _write(drawn, LABELS[trained.resolve(team)], out, console)
 
 
 def _write(drawn: Any, who: str, out: Path, console: Any) -> None:

@@ -10,6 +10,7 @@ from race.envs.micro.recording import Recording, replay
 from race.rollouts.discrete import EpisodeRollouts
 from race.teams.trained import Trained
 from race.types import DiscreteTask, Task
+from race.viewing import framing
 from race.viewing.rendering import Episode, Renderer, choose_renderer, write_video
 from race.viewing.stepwise import DiscreteEpisode
 
@@ -17,6 +18,8 @@ SECONDS = 15.0
 """Of an episode with continuous actions that are shown, unless asked otherwise."""
 STEPS_PER_SECOND = 2
 """Of a battle, at the game's "normal" speed."""
+LABELS = {"marl": "MARL team", "champion": "champion"}
+"""What people are told of teams."""
 
 
 class Film(NamedTuple):
@@ -50,17 +53,26 @@ def film(
     Raises:
         RaceError: if it cannot be played or drawn.
     """
+    named = LABELS[trained.resolve(team)]
+    small = out.suffix.lower() == ".gif"
+    size = framing.SMALL if small else framing.LARGE
     if isinstance(trained.task, Task):
         chosen = choose_renderer() if renderer is None else renderer
         shown = SECONDS if seconds is None else seconds
-        return _drawn(Episode(trained.task, trained.policy(team), seed, shown, chosen))
+        played = trained.policy(team)
+        return _drawn(Episode(trained.task, played, seed, shown, chosen, named, size))
     shown = seconds or 0.0
     if trained.config.task.startswith("micro/"):
-        return _battle(trained, team, seed, shown, out)
+        return _battle(trained, team, seed, shown, small)
     policy = trained.recurrent_policy(team)
     return _drawn(
         DiscreteEpisode(
-            trained.task, lambda seen: policy(seen.obs, seen.avail_actions), seed, shown
+            trained.task,
+            lambda seen: policy(seen.obs, seen.avail_actions),
+            seed,
+            shown,
+            named,
+            size,
         )
     )
 
@@ -94,7 +106,7 @@ def _drawn(episode: Any) -> Film:
     )
 
 
-def _battle(trained: Trained, team: str, seed: int, seconds: float, out: Path) -> Film:
+def _battle(trained: Trained, team: str, seed: int, seconds: float, small: bool) -> Film:
     """A battle is a function of its seed and the actions, so it can be played twice."""
     assert isinstance(trained.task, DiscreteTask)
     name = trained.resolve(team)
@@ -103,17 +115,17 @@ def _battle(trained: Trained, team: str, seed: int, seconds: float, out: Path) -
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     played = make(trained.config.task.removeprefix("micro/"))
-    return of_battle(played, replay(played, actions, seed), out)
+    return of_battle(played, replay(played, actions, seed), LABELS[name], small)
 
 
-def of_battle(played: Any, recording: Recording, out: Path) -> Film:
-    """A film of a battle that was recorded."""
+def of_battle(played: Any, recording: Recording, team: str, small: bool) -> Film:
+    """A film of a battle that was recorded, in the name of a team."""
     from race.envs.micro import render
     from race.envs.micro.canvas import LARGE, SMALL
 
     ended = recording.verdict or "not finished"
     return Film(
-        render.frames(played, recording, SMALL if out.suffix.lower() == ".gif" else LARGE),
+        render.frames(played, recording, SMALL if small else LARGE, team),
         render.n_frames(recording),
         render.FPS,
         lambda: (len(recording.returns), float(recording.returns[-1]), ended),

@@ -20,15 +20,13 @@ from race.envs.contract import in_units
 from race.errors import RenderError, TaskError
 from race.runs.aside import written_aside
 from race.types import Task
+from race.viewing.framing import LARGE, Color, Frame, Headline, Size, framed, picture_size
 
 Backend = Literal["egl", "osmesa", "glfw", "sketch"]
 Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 PACKAGES = "apt-get install -y libegl1 libgl1-mesa-dri"
 """What gives a Debian or Ubuntu machine OpenGL without a display."""
-
-SIZE = (480, 360)
-"""Width and height of frames in pixels."""
 
 _MOST_FRAMES_PER_SECOND = 30.0
 _PROBE = """
@@ -109,7 +107,14 @@ class Episode:
     """
 
     def __init__(
-        self, task: Task, policy: Policy, seed: int, seconds: float, renderer: Renderer
+        self,
+        task: Task,
+        policy: Policy,
+        seed: int,
+        seconds: float,
+        renderer: Renderer,
+        team: str = "",
+        size: Size = LARGE,
     ) -> None:
         """Makes the environment.
 
@@ -119,12 +124,16 @@ class Episode:
             seed: of the environment's reset.
             seconds: stop after this much simulated time; 0 for the whole episode.
             renderer: what draws MuJoCo.
+            team: what frames call the team.
+            size: width and height of a frame in pixels.
 
         Raises:
             RenderError: if the environment is not MuJoCo's and cannot draw itself.
         """
         self._task, self._policy, self._seed = task, policy, seed
-        self._env, self._paint = _painter(task, renderer)
+        self._size = size
+        self._env, self._paint, agents = _painter(task, renderer, picture_size(size))
+        self._headline = Headline(task.spec.task, team, agents)
         step_seconds = _step_seconds(self._env.env)
         self._stride = math.ceil(1 / step_seconds / _MOST_FRAMES_PER_SECOND - 1e-6)
         self.fps = 1 / step_seconds / self._stride
@@ -140,7 +149,7 @@ class Episode:
         high = np.array(self._task.spec.action_high, np.float32)
         with contextlib.closing(self._env):
             state: Any = self._env.reset(self._seed)
-            yield self._paint(self._caption())
+            yield self._frame()
             for _ in range(self._steps):
                 action = np.clip(self._policy(state), -1, 1)
                 made = self._env.step(in_units(action, low, high))
@@ -148,30 +157,35 @@ class Episode:
                 self.episode_return += made.reward
                 self.steps += 1
                 if self.steps % self._stride == 0:
-                    yield self._paint(self._caption())
+                    yield self._frame()
                 if made.terminated or made.truncated:
                     return
 
-    def _caption(self) -> str:
-        return f"step {self.steps}   return {self.episode_return:.0f}"
+    def _frame(self) -> Frame:
+        return framed(self._paint(), self._size, self._headline, self.steps, self.episode_return)
 
 
-def _painter(
-    task: Task, renderer: Renderer
-) -> tuple[CheckedEnv, Callable[[str], NDArray[np.uint8]]]:
+class _Painter(NamedTuple):
+    env: CheckedEnv
+    paint: Callable[[], Frame]
+    agents: tuple[Color, ...]
+    """Their colours; none where the environment chooses the colours."""
+
+
+def _painter(task: Task, renderer: Renderer, size: Size) -> _Painter:
     import mujoco
 
-    from race.viewing import sketch
+    from race.viewing import limbs, sketch
 
     env = CheckedEnv(task)
     inner = getattr(env.env, "unwrapped", env.env)
     model, data = (getattr(inner, name, None) for name in ("model", "data"))
     if isinstance(model, mujoco.MjModel) and isinstance(data, mujoco.MjData):
+        agents = limbs.paint(model, task.spec)
         if _taken_up(renderer.backend):
             with contextlib.suppress(Exception):  # mujoco took up another backend, or none
-                scene = _opengl(model, data)
-                return env, lambda caption: sketch.with_caption(scene(), caption)
-        return env, lambda caption: sketch.draw(model, data, SIZE, caption)
+                return _Painter(env, _opengl(model, data, size), agents)
+        return _Painter(env, lambda: sketch.draw(model, data, size), agents)
     offered = getattr(env.env, "metadata", None) or {}
     with contextlib.suppress(TaskError):  # it is not needed any more
         env.close()
@@ -181,7 +195,7 @@ def _painter(
             "no render_mode 'rgb_array'. Add that mode to the environment to make videos of it."
         )
     drawn = CheckedEnv(task, render_mode="rgb_array")
-    return drawn, lambda caption: sketch.with_caption(drawn.render(), caption)
+    return _Painter(drawn, drawn.render, ())
 
 
 def _taken_up(backend: Backend) -> bool:
@@ -192,22 +206,24 @@ def _taken_up(backend: Backend) -> bool:
     return context is not None and context.__module__ == f"mujoco.{backend}"
 
 
-def _opengl(model: Any, data: Any) -> Callable[[], NDArray[np.uint8]]:
+def _opengl(model: Any, data: Any, size: Size) -> Callable[[], Frame]:
     """Draws with OpenGL, through the same camera as the built-in renderer."""
     import mujoco
 
-    from race.viewing import sketch
+    from race.viewing.camera import focus
 
-    width, height = SIZE
+    width, height = size
+    shown = model.vis.global_
+    shown.offwidth, shown.offheight = max(shown.offwidth, width), max(shown.offheight, height)
     opengl = mujoco.Renderer(model, height, width)
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    model.vis.global_.fovy = sketch.focus(model, data).field_of_view
+    shown.fovy = focus(model, data).field_of_view
     # A plane collides everywhere but is drawn as large as its size says; 0 stands for endless.
     model.geom_size[model.geom_type == int(mujoco.mjtGeom.mjGEOM_PLANE), :2] = 0.0
 
-    def scene() -> NDArray[np.uint8]:
-        seen = sketch.focus(model, data)
+    def scene() -> Frame:
+        seen = focus(model, data)
         camera.lookat[:] = seen.target
         camera.distance = seen.distance
         camera.azimuth = math.degrees(math.atan2(-seen.backward[1], -seen.backward[0]))

@@ -5,11 +5,12 @@ import math
 from collections.abc import Callable, Iterator
 from typing import final
 
-from jaxtyping import Int, UInt8
+from jaxtyping import Int
 from numpy import ndarray
 
 from race.envs.checked import CheckedEnv
 from race.types import DiscreteTask, Observation
+from race.viewing.framing import LARGE, Frame, Headline, Size, framed
 from race.viewing.rendering import frames_per_second
 
 STEPS_PER_SECOND = 2.0
@@ -35,6 +36,8 @@ class DiscreteEpisode:
         policy: Callable[[Observation], Int[ndarray, "N"]],
         seed: int,
         seconds: float,
+        team: str = "",
+        size: Size = LARGE,
     ) -> None:
         """Makes the environment.
 
@@ -43,12 +46,15 @@ class DiscreteEpisode:
             policy: the team's next actions, from what it sees; it begins an episode.
             seed: of the environment's reset.
             seconds: stop after this much time as it is shown; 0 for the whole episode.
+            team: what frames call the team.
+            size: width and height of a frame in pixels.
 
         Raises:
             TaskError: if the environment cannot be made.
             RenderError: if it has no pictures.
         """
-        self._policy, self._seed = policy, seed
+        self._policy, self._seed, self._size = policy, seed, size
+        self._headline = Headline(task.spec.task, team)
         self._env = CheckedEnv(task, render_mode="rgb_array")
         self.fps = frames_per_second(self._env.env, STEPS_PER_SECOND)
         limit = task.spec.episode_limit
@@ -57,7 +63,7 @@ class DiscreteEpisode:
         self.episode_return = 0.0
         self.steps = 0
 
-    def frames(self) -> Iterator[UInt8[ndarray, "h w 3"]]:
+    def frames(self) -> Iterator[Frame]:
         """Plays the episode; yields images and closes the environment.
 
         Raises:
@@ -66,13 +72,17 @@ class DiscreteEpisode:
         """
         with contextlib.closing(self._env):
             seen = self._env.reset(self._seed)
-            yield self._env.render()
+            yield self._frame()
             for _ in range(self._most):
                 assert isinstance(seen, Observation)
                 step = self._env.step(self._policy(seen))
                 seen = step.seen
                 self.episode_return += step.reward
                 self.steps += 1
-                yield self._env.render()
+                yield self._frame()
                 if step.terminated or step.truncated:
                     return
+
+    def _frame(self) -> Frame:
+        picture = self._env.render()
+        return framed(picture, self._size, self._headline, self.steps, self.episode_return)

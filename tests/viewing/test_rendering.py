@@ -14,7 +14,7 @@ import pytest
 
 from race.envs import factorised, make_task
 from race.errors import RenderError
-from race.viewing import rendering, sketch
+from race.viewing import camera, rendering, sketch
 from race.viewing.rendering import Episode, Renderer, choose_renderer, write_video
 
 SKETCH = Renderer("sketch", "a test")
@@ -81,7 +81,7 @@ def test_sketches_show_the_robot_and_follow_it(robot: str) -> None:
     env.data.qpos[0] += 10.0
     mujoco.mj_forward(env.model, env.data)
     np.testing.assert_allclose(
-        sketch.focus(env.model, env.data).target[0], env.data.qpos[0], atol=0.6
+        camera.focus(env.model, env.data).target[0], env.data.qpos[0], atol=0.6
     )
     # Another pose: another image.
     env.data.qpos[-2:] += 0.7
@@ -177,7 +177,8 @@ def test_environments_that_are_not_mujoco_draw_themselves() -> None:
     )
     policy = lambda state: np.zeros(1, np.float32)  # noqa: E731
     frames = list(Episode(task, policy, 0, 0.0, SKETCH).frames())
-    assert [int(frame[-1, -1, 0]) for frame in frames] == [0, 50, 100, 150]
+    assert {frame.shape for frame in frames} == {(720, 1280, 3)}
+    assert [int(frame[400, 640, 0]) for frame in frames] == [0, 50, 100, 150]
 
     class Blind(Drawable):
         metadata = {"render_modes": []}  # noqa: RUF012

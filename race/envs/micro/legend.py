@@ -42,11 +42,11 @@ class _Count(NamedTuple):
 class Legend:
     """A bar above a battle or a panel left of it, as the view has room."""
 
-    def __init__(self, spec: MapSpec, view: View) -> None:
+    def __init__(self, spec: MapSpec, view: View, team: str = "") -> None:
         _, top, right, bottom = view.legend
-        self._spec, self._box = spec, view.legend
+        self._spec, self._box, self._team = spec, view.legend, team
         self._panel = bottom - top > right
-        needed = 12 + sum(len(_types(spec, side)) for side in _sides(spec))
+        needed = 13 + sum(len(_types(spec, side)) for side in _sides(spec))
         self._line = (bottom - top) / (max(_LINES, needed) if self._panel else 2)
         self._text = max(round(0.54 * self._line), 8)
         self._pad = 0.4 * self._line
@@ -58,7 +58,7 @@ class Legend:
         box, spec = self._box, self._spec
         frame[box.top : box.bottom, box.left : box.right] = _BACK
         self._counts = []
-        left, top = self._pad, self._pad + 6 * self._line if self._panel else self._line
+        left, top = self._pad, self._pad + 7 * self._line if self._panel else self._line
         for (title, color), side in zip(_TITLES, _sides(spec), strict=True):
             if side.start and not self._panel:
                 left = box.right / 2
@@ -76,6 +76,7 @@ class Legend:
         steps = -(-standing.loops // LOOPS_PER_STEP)
         lines = [
             self._title,
+            *([words(self._team, self._text, colors.GREY)] if self._team else []),
             words(f"{standing.loops / LOOPS_PER_SECOND:.1f} s", self._text, colors.GREY),
             words(f"step {steps}/{limit}", self._text, colors.GREY),
             words(f"return {standing.episode_return:.2f}", self._text, colors.GREY),

@@ -34,7 +34,9 @@ _SHARES: Final = 40
 """Lengths of a ring that are told apart."""
 
 
-def frames(played: Battle, recording: Recording, size: tuple[int, int] = LARGE) -> Iterator[Frame]:
+def frames(
+    played: Battle, recording: Recording, size: tuple[int, int] = LARGE, team: str = ""
+) -> Iterator[Frame]:
     """A frame for each moment of a recording, of the part of the map that it uses.
 
     The last frame of a battle that has ended is repeated for a while (`n_frames` counts all).
@@ -43,8 +45,9 @@ def frames(played: Battle, recording: Recording, size: tuple[int, int] = LARGE) 
         played: the map.
         recording: of a battle on it.
         size: width and height of a frame in pixels.
+        team: who plays, for the legend.
     """
-    painter = Painter(played, used(played.spec, recording.units), size)
+    painter = Painter(played, used(played.spec, recording.units), size, team)
     moments = len(recording.units.x)
     for moment in range(moments):
         painter.see(Units(*(leaf[moment] for leaf in recording.units)))
@@ -107,17 +110,20 @@ class Painter:
         view: where the map lies in a frame.
     """
 
-    def __init__(self, played: Battle, window: Window, size: tuple[int, int] = LARGE) -> None:
+    def __init__(
+        self, played: Battle, window: Window, size: tuple[int, int] = LARGE, team: str = ""
+    ) -> None:
         """A painter of a map.
 
         Args:
             played: the map.
             window: what must be in the picture; there may be more.
             size: width and height of a frame in pixels.
+            team: who plays, for the legend.
         """
         spec, scenario = played.spec, jax.tree.map(np.asarray, played.scenario)
         self.view = view = fit(window, spec.cells.shape, size, short_legend=is_short(spec))
-        self._watch, self._legend = Watch(scenario), Legend(spec, view)
+        self._watch, self._legend = Watch(scenario), Legend(spec, view, team)
         left, top, right, bottom = view.box
         self._back = np.zeros((size[1], size[0], 3), np.uint8)
         self._back[top:bottom, left:right] = ground.paint(spec, view)
