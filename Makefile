@@ -6,10 +6,13 @@ BIN := .venv/bin
 
 demo: .venv/installed
 	@rm -rf demo
-	$(BIN)/race train mamujoco/HalfCheetah-2x3 --preset demo --env-steps 80000 --run-dir demo
-	$(BIN)/race plot demo --team all --out demo/curve.png
-	$(BIN)/race render demo --out demo/team.mp4
-	@echo "The learning curve is in demo/curve.png and the video of the trained team in demo/team.mp4"
+	$(BIN)/race sweep docs/examples/demo.toml --run-dir demo/runs
+	$(BIN)/race plot demo/runs --team all --out demo/curve.png
+	$(BIN)/race render demo/runs/mamujoco-HalfCheetah-2x3-race-matd3-seed1 --out demo/team.mp4
+	@echo "demo/curve.png: RACE's teams and its base MATD3 alone, one seed each: too few to tell which"
+	@echo "is better. RACE's 'selected' is its MARL team or its champion, whichever had the better"
+	@echo "training episodes; chosen by luck in part, it may test worse than the MARL team."
+	@echo "demo/team.mp4: a video of it."
 
 test: .venv/installed-dev
 	$(BIN)/ruff check .

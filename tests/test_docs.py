@@ -193,3 +193,22 @@ def test_make_targets_exist() -> None:
     assert targets == ["demo", "test"]
     makefile = (ROOT / "Makefile").read_text()
     assert all(f"\n{target}:" in makefile for target in targets)
+
+
+@pytest.mark.slow
+def test_the_demo_makes_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = (ROOT / "Makefile").read_text().split("\ndemo: ")[1].split("\n\n")[0]
+    monkeypatch.chdir(tmp_path)
+    settings = (ROOT / "docs/examples/demo.toml").read_text()
+    assert "env_steps = 80_000" in settings
+    Path("docs/examples").mkdir(parents=True)
+    Path("docs/examples/demo.toml").write_text(
+        settings.replace("80_000", "3_000\nlearner.random_steps = 2_900\nevaluation.episodes = 1")
+    )
+    commands = re.findall(r"\$\(BIN\)/race (.*)", recipe)
+    assert len(commands) == 3
+    for command in commands:
+        words = shlex.split(command)
+        main([*words, *(["--seconds", "0.3"] if words[0] == "render" else [])])
+    for made in re.findall(r"demo/\w+\.\w+", (ROOT / "README.md").read_text()):
+        assert Path(made).stat().st_size > 1000
