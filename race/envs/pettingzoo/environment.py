@@ -1,5 +1,6 @@
 """A team of a PettingZoo environment as a gymnasium environment, which all the rest trains on."""
 
+import itertools
 from typing import Any, Final, final
 
 import gymnasium
@@ -89,7 +90,8 @@ class TeamEnv(gymnasium.Env[Any, Any]):
             kind: Any = np.float32 if exact else np.float64
             self.action_space = spaces.Box(low.astype(kind), high.astype(kind), dtype=kind)
             self.observation_space = state
-            self._ends = np.cumsum([len(reach.low) for reach in self._reaches])[:-1]
+            ends = np.cumsum([0, *(len(reach.low) for reach in self._reaches)]).tolist()
+            self._parts = [slice(*pair) for pair in itertools.pairwise(ends)]
             return
         n = len(parallel.team)
         self.action_space = spaces.MultiDiscrete([self.n_actions] * n)
@@ -184,10 +186,12 @@ class TeamEnv(gymnasium.Env[Any, Any]):
         )
 
     def _units(self, action: NDArray[Any]) -> dict[Any, Any]:
-        parts = np.split(np.asarray(action), self._ends)
+        joint = np.asarray(action)
         return {
-            agent: reach.action(part)
-            for agent, reach, part in zip(self.parallel.team, self._reaches, parts, strict=True)
+            agent: reach.action(joint[part])
+            for agent, reach, part in zip(
+                self.parallel.team, self._reaches, self._parts, strict=True
+            )
         }
 
     def _chosen(
