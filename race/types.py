@@ -405,7 +405,8 @@ class DiscreteTask(NamedTuple):
     agent, [N]. ``render_mode`` is None or ``"rgb_array"``. ``device()``, where there is one,
     returns the same task for rollouts on the device. ``seeded`` is False where an environment has
     no place for a seed, so that its episodes do not repeat. ``facts`` are what else decides what a
-    run means, by name, as plain JSON values; they are kept in ``metadata.json``.
+    run means, by name, as plain JSON values; they are kept in ``metadata.json``. ``waits`` tells
+    that a step waits for another program, a game: environments are then worth processes.
     """
 
     spec: DiscreteSpec
@@ -413,6 +414,7 @@ class DiscreteTask(NamedTuple):
     device: Callable[[], DeviceEnv] | None = None
     seeded: bool = True
     facts: tuple[tuple[str, Any], ...] = ()
+    waits: bool = False
 
 
 class Task(NamedTuple):

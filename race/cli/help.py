@@ -94,12 +94,22 @@ def _asked(command: Any, words: list[str]) -> Any:
 
 def _idle(asked: Any) -> frozenset[str]:
     """Names of the settings that a task has no use for."""
-    from race.envs import discrete_probe, make_task, probe, reads_config, reads_team
+    from race.envs import (
+        discrete_probe,
+        make_task,
+        probe,
+        reads_config,
+        reads_game,
+        reads_team,
+        starcraft,
+    )
     from race.types import DiscreteTask
 
     task = asked.task
     if task.startswith("micro/") or task in discrete_probe.PROBES:
         discrete, on_host = True, False
+    elif starcraft.is_game(task):
+        discrete, on_host = True, True
     elif task.startswith("mamujoco/") or task in probe.PROBES:
         discrete, on_host = False, True
     else:  # somebody's own has to be looked at
@@ -114,6 +124,7 @@ def _idle(asked: Any) -> frozenset[str]:
         reads_env=reads_config(task),
         on_host=on_host,
         reads_parallel=reads_team(task),
+        reads_game=reads_game(task),
     )
 
 

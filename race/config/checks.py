@@ -260,6 +260,12 @@ def _env_rules(env: EnvConfig) -> list[Rule]:
             """a JSON object, such as '{"N": 4}' with the shell's quotes around it""",
         ),
         (
+            env.python is None or env.python.strip() != "",
+            "env.python",
+            "empty",
+            "the path of a Python interpreter, or left out for this one",
+        ),
+        (
             all(part.strip() for part in env.agents.split(",")),
             "env.agents",
             env.agents or "empty",

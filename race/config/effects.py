@@ -18,7 +18,7 @@ _MATD3_ALONE = ("policy_delay", "smoothing_noise", "smoothing_clip")
 _MIXER = ("mixer_size", "hypernet_size")
 _OBSERVATION = ("agent_obsk", "local_categories", "global_categories")
 _PARALLEL = (
-    *("kwargs", "agents", "others", "team_reward", "state", "episode_limit"),
+    *("agents", "others", "team_reward", "state", "episode_limit"),
     "largest_observation",
 )
 _HOST = ("processes", "retries", "step_seconds")
@@ -45,6 +45,7 @@ def refuse_without_effect(
     reads_env: bool,
     on_host: bool,
     reads_parallel: bool = False,
+    reads_game: bool = False,
 ) -> None:
     """Refuses settings that nothing would read.
 
@@ -55,6 +56,7 @@ def refuse_without_effect(
         reads_env: whether the task reads what its agents observe.
         on_host: whether its environments run on the host.
         reads_parallel: whether the task reads who the team of a PettingZoo environment is.
+        reads_game: whether it reads which interpreter plays StarCraft II.
 
     Raises:
         ConfigError: naming the settings, and why they would have no effect.
@@ -65,6 +67,7 @@ def refuse_without_effect(
         "reads_env": reads_env,
         "on_host": on_host,
         "reads_parallel": reads_parallel,
+        "reads_game": reads_game,
     }
     for name, why in without_effect(asked, defaults, **facts).items():
         told.setdefault(why, []).append(f"--{name.replace('_', '-')}")
@@ -83,11 +86,13 @@ def without_effect(
     reads_env: bool,
     on_host: bool,
     reads_parallel: bool = False,
+    reads_game: bool = False,
 ) -> dict[str, str]:
     """The settings that are not what they usually are, though nothing would read them; and why."""
     found: dict[str, str] = {}
     facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
-    for name, why in _idle(asked, **facts, reads_parallel=reads_parallel):
+    told = {"reads_parallel": reads_parallel, "reads_game": reads_game}
+    for name, why in _idle(asked, **facts, **told):
         if name not in found and setting(asked, name) != usual(name, defaults):
             found[name] = why
     return found
@@ -105,15 +110,12 @@ def usual(name: str, defaults: LearnerConfig) -> Any:
     return getattr(defaults if group == "learner" else _DEFAULTS[group], field)
 
 
-def idle(
-    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool, reads_parallel: bool
-) -> frozenset[str]:
+def idle(asked: Config, **facts: bool) -> frozenset[str]:
     """The names of settings that nothing would read, such as ``learner.policy_delay``.
 
     Arguments are those of `refuse_without_effect`.
     """
-    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
-    return frozenset(name for name, _ in _idle(asked, **facts, reads_parallel=reads_parallel))
+    return frozenset(name for name, _ in _idle(asked, **facts))
 
 
 _DEFAULTS: dict[str, Any] = {
@@ -125,7 +127,13 @@ _DEFAULTS: dict[str, Any] = {
 
 
 def _idle(
-    asked: Config, *, discrete: bool, reads_env: bool, on_host: bool, reads_parallel: bool
+    asked: Config,
+    *,
+    discrete: bool,
+    reads_env: bool,
+    on_host: bool,
+    reads_parallel: bool,
+    reads_game: bool,
 ) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
     yield from _idle_of_population(asked)
@@ -139,6 +147,11 @@ def _idle(
     if not reads_parallel:
         why = f"on {asked.task}, which is no PettingZoo task"
         yield from ((f"env.{name}", why) for name in _PARALLEL)
+    if not reads_game:
+        yield "env.python", f"on {asked.task}, which is no game of StarCraft II"
+    if not (reads_parallel or reads_game):
+        why = f"on {asked.task}, whose environment takes no arguments"
+        yield "env.kwargs", why
     if not on_host:
         why = f"on {asked.task}, which runs in one compiled program"
         yield from ((f"env.{name}", why) for name in _HOST)

@@ -245,7 +245,11 @@ class EnvConfig:
     library_observation: bool = False
     """Use gymnasium-robotics' own default observation instead of the three settings above."""
     kwargs: str = "{}"
-    """Arguments of the PettingZoo environment, as a JSON object, such as '{"N": 4}'."""
+    """Arguments of the PettingZoo environment, or of SMAC's, as a JSON object, such as
+    '{"N": 4}'."""
+    python: str | None = None
+    """Of smac/* and smacv2/*: the interpreter in which SMAC is installed, which need not have
+    race. None: this one."""
     agents: str = "*"
     """Its agents that are the team: patterns such as 'adversary_*', with commas in between."""
     others: str = "random"
@@ -409,6 +413,7 @@ _BEFORE: dict[str, Any] = {
     "keep_best": 0,
     "init_from": None,
     "kwargs": "{}",
+    "python": None,
     "agents": "*",
     "others": "random",
     "team_reward": "mean",

@@ -7,9 +7,11 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium
 
+from race.envs import starcraft
 from race.envs.pettingzoo import TeamEnv
 from race.envs.pettingzoo.vectors import Choices, Sight, leaves, named
-from race.types import AnyTask, EnvSpec
+from race.errors import TaskError
+from race.types import AnyTask, DiscreteSpec, EnvSpec
 
 _POSITIONS: Final = {0: ("x", "y", "z", "qw", "qx", "qy", "qz"), 1: ("qw", "qx", "qy", "qz")}
 _VELOCITIES: Final = {0: ("vx", "vy", "vz", "wx", "wy", "wz"), 1: ("wx", "wy", "wz")}
@@ -45,6 +47,8 @@ def layout(task_id: str, task: AnyTask) -> Layout:
     try:
         if isinstance(env, TeamEnv):
             return _of_team(env)
+        if starcraft.is_game(task_id):
+            return _of_game(task_id, env)
         if task_id.startswith("mamujoco/"):
             state, moved = _of_robot(env)
         else:
@@ -72,6 +76,21 @@ def _of_spec(task: AnyTask, state: list[str], moved: list[str]) -> Layout:
         tuple(tuple(state[entry] for entry in agent) for agent in spec.obs_index),
         tuple(tuple(moved[entry] for entry in agent) for agent in spec.action_index),
     )
+
+
+def _of_game(task_id: str, env: Any) -> Layout:
+    sizes: DiscreteSpec = env.sizes
+    package, _, map_name = task_id.partition("/")
+    if package == "smac":
+        from race.envs.micro import naming  # imports jax
+
+        with contextlib.suppress(TaskError):  # not one of those that micro/* has
+            found = Layout(*naming.names(map_name))
+            if (len(found.state), len(found.obs[0])) == (sizes.state_size, sizes.obs_size):
+                return found
+    state, obs, actions = starcraft.names(env)
+    agents = tuple(f"agent {number}" for number in range(sizes.n_agents))
+    return Layout(agents, state, (obs,) * len(agents), (actions,) * len(agents))
 
 
 def _of_team(env: TeamEnv) -> Layout:

@@ -52,7 +52,7 @@ def pymarl_task(make: Callable[[], Any], task: str, *, has_wins: bool = False) -
     """
     env = make()
     try:
-        spec = _spec(env, task, has_wins)
+        spec = spec_of(env, task, has_wins)
         seeded = _takes_seed(env)
     finally:
         with contextlib.suppress(Exception, SystemExit):  # it would hide what was wrong before
@@ -76,7 +76,12 @@ def _make(
     return PymarlEnv(make(), task, has_wins=has_wins, render_mode=render_mode)
 
 
-def _spec(env: Any, task: str, has_wins: bool) -> DiscreteSpec:
+def spec_of(env: Any, task: str, has_wins: bool) -> DiscreteSpec:
+    """The sizes of an environment with PyMARL's interface.
+
+    Raises:
+        TaskError: if it lacks a method or a size.
+    """
     missing = [name for name in _METHODS if not callable(getattr(env, name, None))]
     if missing:
         raise TaskError(
@@ -145,7 +150,7 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             TaskError: if the environment lacks a method or a size.
             RenderError: for a render mode that it does not offer.
         """
-        self.sizes = _spec(env, task, has_wins)
+        self.sizes = spec_of(env, task, has_wins)
         if render_mode not in (None, "rgb_array"):
             raise RenderError(
                 f"Task {task} can be rendered as 'rgb_array' or not at all (None), not as "
@@ -171,6 +176,11 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         self._available: NDArray[np.int8] | None = None
         self._steps = 0
         self._over = True
+
+    @property
+    def inner(self) -> Any:
+        """The environment with PyMARL's interface."""
+        return self._env
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

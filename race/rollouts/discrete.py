@@ -54,10 +54,12 @@ class EpisodeRollouts:
         """
         self._config, self._spec, self._runs = config, task.spec, runs
         self._env = task.device() if on_device and task.device is not None else None
+        asked = config.env.processes
+        in_processes = task.waits if asked is None else asked
         pool = EnvPool(
             task,
             max(config.n_teams, 2 * TESTS_AT_ONCE_ON_HOST),  # of two teams
-            bool(config.env.processes) or config.env.step_seconds is not None,
+            in_processes or config.env.step_seconds is not None,
             retries=config.env.retries,
             step_seconds=config.env.step_seconds,
             proven=proven,

@@ -10,7 +10,7 @@ from race.config.effects import refuse_without_effect, setting, usual, without_e
 from race.config.files import Wanted, with_settings
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config
-from race.envs import pettingzoo, reads_config, reads_team
+from race.envs import pettingzoo, reads_config, reads_game, reads_team, starcraft
 from race.envs.own import is_own
 from race.envs.trial import try_out
 from race.errors import ConfigError, say
@@ -92,12 +92,13 @@ def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
         "reads_env": reads_config(asked.task),
         "on_host": not isinstance(task, DiscreteTask) or task.device is None,
         "reads_parallel": reads_team(asked.task),
+        "reads_game": reads_game(asked.task),
     }
 
 
 def is_tried(task_id: str) -> bool:
     """Whether an environment of that name is looked at before it is trained on; others repeat."""
-    return is_own(task_id) or task_id.startswith(pettingzoo.PREFIX)
+    return is_own(task_id) or task_id.startswith(pettingzoo.PREFIX) or starcraft.is_game(task_id)
 
 
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
@@ -108,6 +109,11 @@ def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     """
     if not is_tried(task_id):
         return {"repeats": True}
+    if starcraft.is_game(task_id):
+        assert isinstance(task, DiscreteTask)
+        libraries = starcraft.try_out(task)
+        say(starcraft.NOTE)
+        return {"repeats": False, "packages": libraries}
     trial = try_out(task)
     if trial.note:
         say(trial.note)
