@@ -30,11 +30,12 @@ class Finding(NamedTuple):
     remedy: str = ""  # the command that mends it
 
 
-def examine(cache: Path) -> Iterator[Finding]:
+def examine(cache: Path, python: str | None = None) -> Iterator[Finding]:
     """Looks at everything, one finding after the other. Raises nothing.
 
     Args:
         cache: folder of the compilation cache.
+        python: the interpreter that has SMAC; None: this one.
     """
     yield Finding("race", "ok", f"{__version__}, in {Path(__file__).parent}")
     yield _python()
@@ -47,6 +48,7 @@ def examine(cache: Path) -> Iterator[Finding]:
         ("machine", _machine, ""),
         ("compilation cache", lambda: _cache(cache), f"mkdir -p {cache}"),
         ("disk", _disk, ""),
+        ("StarCraft II", lambda: _starcraft(python), "race doctor --python PATH"),
     ]
     for name, check, remedy in checks:
         try:
@@ -135,6 +137,37 @@ def _machine() -> Finding:
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     status: Status = "ok" if memory >= 2 else "warning"
     return Finding("machine", status, f"{count} cores, {memory:.0f} GiB of memory")
+
+
+def _starcraft(python: str | None) -> Finding:
+    """Optional: smac/* and smacv2/* alone need it."""
+    from race.envs import starcraft
+    from race.envs.starcraft import telling
+
+    looks = {package: starcraft.look(package, python) for package in telling.SOURCES}
+    found = {package: look for package, look in looks.items() if look.there}
+    if not found:
+        where = looks["smac"].python
+        return Finding(
+            "StarCraft II",
+            "warning",
+            f"neither SMAC nor SMACv2 is in {where}: smac/* and smacv2/* need one of them",
+            f"{telling.install('smac')} (or smacv2.git, or both); get {telling.GAME}; then "
+            f"race doctor --python {telling.MADE} (docs/starcraft.md)",
+        )
+    told = [
+        f"{package} {look.facts['code']}; game {look.facts['game']}; "
+        + ", ".join(f"{name} {version}" for name, version in look.facts["libraries"].items())
+        for package, look in found.items()
+        if not look.wrong
+    ]
+    wrong = list(dict.fromkeys(look.wrong for look in found.values() if look.wrong))
+    return Finding(
+        "StarCraft II",
+        "warning" if wrong else "ok",
+        "; ".join(told) or "not set up",
+        " ".join(wrong),
+    )
 
 
 def _cache(cache: Path) -> Finding:

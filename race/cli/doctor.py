@@ -13,10 +13,13 @@ class Doctor:
     Exits with 1 if something that race needs is missing.
     """
 
+    python: str | None = None
+    """The interpreter with SMAC, for smac/* and smacv2/*. None: this one."""
+
 
 def main(arguments: list[str]) -> None:
     """Looks and prints."""
-    tyro.cli(Doctor, args=arguments, prog="race doctor")
+    chosen = tyro.cli(Doctor, args=arguments, prog="race doctor")
     from rich.table import Table
     from rich.text import Text
 
@@ -33,7 +36,7 @@ def main(arguments: list[str]) -> None:
     }
     findings = []
     with streams.console(stderr=True).status("looking"):
-        for finding in examine(cache_directory()):
+        for finding in examine(cache_directory(), chosen.python):
             findings.append(finding)
             table.add_row(marks[finding.status], finding.name, finding.detail)
     console.print(table)

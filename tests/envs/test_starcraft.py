@@ -1,6 +1,7 @@
 """StarCraft II behind SMAC, with stand-ins for both: what is asked, checked, told and ended."""
 
 import ast
+import contextlib
 import dataclasses
 import io
 import json
@@ -90,6 +91,16 @@ def gone(process_ids: list[int], seconds: float = 15) -> bool:
             return True
         time.sleep(0.05)
     return False
+
+
+def processes_in(folder: Path) -> list[int]:
+    """Those whose program lies in a folder."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            if str(folder) in path.read_bytes().decode(errors="replace"):
+                found.append(int(path.parent.name))
+    return found
 
 
 def processes_of(seen: Any) -> list[int]:
@@ -309,8 +320,8 @@ def test_commit_and_version_of_smac(tmp_path: Path, sc2path: Path) -> None:
     (notes / "METADATA").write_text("Metadata-Version: 2.1\nName: SMAC\nVersion: 1.0.0\n")
     source = {"url": "there", "vcs_info": {"vcs": "git", "commit_id": "abc123"}}
     (notes / "direct_url.json").write_text(json.dumps(source))
-    found, wrong = starcraft.look("smac", written_python(tmp_path / "bin", tmp_path / "code"))
-    assert (wrong, found["code"]) == ("", "1.0.0, commit abc123")
+    found = starcraft.look("smac", written_python(tmp_path / "bin", tmp_path / "code"))
+    assert (found.wrong, found.facts["code"]) == ("", "1.0.0, commit abc123")
 
 
 def test_what_is_missing_is_told_with_what_to_do(

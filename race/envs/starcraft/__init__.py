@@ -8,17 +8,17 @@ an environment with PyMARL's interface. What people are told when something is m
 import contextlib
 import functools
 import json
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from race.config.settings import EnvConfig
 from race.envs.checked import CheckedEnv
 from race.envs.pymarl import PymarlEnv, spec_of
 from race.envs.starcraft import game, scenarios, telling
-from race.envs.starcraft.remote import RemoteBattle, Wanted, Worker, interpreter
+from race.envs.starcraft.remote import OPENING_SECONDS, RemoteBattle, Wanted, Worker, interpreter
 from race.errors import EnvFailedError, TaskError
 from race.types import DiscreteTask
 
-__all__ = ["NOTE", "Wanted", "is_game", "look", "make_task", "names", "try_out"]
+__all__ = ["NOTE", "Installed", "Wanted", "is_game", "look", "make_task", "names", "try_out"]
 
 NOTE: Final = (
     "Note: StarCraft II is given its seed when it starts, not for each battle, so that a run that "
@@ -26,6 +26,18 @@ NOTE: Final = (
 )
 _PACKAGES: Final = ("smac", "smacv2")
 _ACTIONS: Final = ("nothing (dead)", "stop", "north", "south", "east", "west")
+
+
+class Installed(NamedTuple):
+    """What an interpreter has of ``smac`` or ``smacv2``."""
+
+    python: str
+    facts: dict[str, Any]
+    """Versions, the game and where it is; empty if anything is wrong."""
+    wrong: str = ""
+    """What is, and what to do."""
+    there: bool = True
+    """Whether there is a package of that name at all."""
 
 
 def is_game(task_id: str) -> bool:
@@ -107,8 +119,8 @@ def names(env: PymarlEnv) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, 
     return state, obs, (*_ACTIONS, *(f"target {number}" for number in targets))
 
 
-def look(package: str, python: str | None = None) -> tuple[dict[str, Any], str]:
-    """What is installed for ``smac`` or ``smacv2``, and what is wrong; one of them is empty.
+def look(package: str, python: str | None = None) -> Installed:
+    """What is installed for ``smac`` or ``smacv2``.
 
     Args:
         package: ``smac`` or ``smacv2``.
@@ -119,12 +131,12 @@ def look(package: str, python: str | None = None) -> tuple[dict[str, Any], str]:
     """
     worker = Worker(python)
     try:
-        answer, _ = worker.ask({"do": "look", "package": package}, 180.0)
-        found: dict[str, Any] = answer["found"]
-        return found, ""
+        answer, _ = worker.ask({"do": "look", "package": package}, OPENING_SECONDS)
+        return Installed(worker.python, answer["found"])
     except game.RefusedError as error:
-        return {}, telling.missing(package, worker.python, error.kind, error.facts)
+        wrong = telling.missing(package, worker.python, error.kind, error.facts)
+        return Installed(worker.python, {}, wrong, error.kind != "missing")
     except EnvFailedError as error:
-        return {}, str(error)
+        return Installed(worker.python, {}, str(error))
     finally:
         worker.close()

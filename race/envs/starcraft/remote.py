@@ -20,7 +20,7 @@ from race.envs.starcraft import game, telling
 from race.errors import EnvFailedError, TaskError
 
 _PROGRAM: Final = Path(game.__file__)
-_OPENING_SECONDS: Final = 180.0
+OPENING_SECONDS: Final = 180.0
 """Importing SMAC from a slow disk takes its time."""
 _CLOSING_SECONDS: Final = 4.0
 _LAST_LINES: Final = 3
@@ -203,7 +203,7 @@ class RemoteBattle:
         self._worker = Worker(wanted.python)
         asked = {**wanted._asdict(), "do": "open"}
         try:
-            self.told, _ = self._worker.ask(asked, _OPENING_SECONDS)
+            self.told, _ = self._worker.ask(asked, OPENING_SECONDS)
         except BaseException as error:
             self._worker.close()
             if isinstance(error, game.RefusedError):
@@ -272,4 +272,5 @@ class RemoteBattle:
         where = f"at step {self._steps} of an episode" if self._steps else "when a battle began"
         if message["do"] == "render":
             where = "when it was drawn"
+            text += " PySC2 draws with Python 3.10 or older."
         raise EnvFailedError(f"The game of {self._wanted.task} failed {where}: {text}")

@@ -9,10 +9,11 @@ SOURCES: Final = {
     "smacv2": "https://github.com/oxwhirl/smacv2",
 }
 INSTALL: Final = (
-    "python3.11 -m venv sc2-python && sc2-python/bin/pip install 'pysc2==4.0.0' 'protobuf<3.21' "
+    "python3.10 -m venv sc2-python && sc2-python/bin/pip install 'pysc2==4.0.0' 'protobuf<3.21' "
     "pyyaml 'git+{source}.git'"
 )
-"""Versions that go together: newer protobuf refuses what the game's protocol is written with."""
+"""Versions that go together: newer protobuf refuses what the game's protocol is written with, and
+PySC2 draws no pictures with newer Pythons."""
 GAME: Final = (
     "StarCraft II 4.10 for Linux (github.com/Blizzard/s2client-proto, Downloads), unpacked, with "
     "SC2PATH set to its folder"
