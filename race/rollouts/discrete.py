@@ -62,7 +62,7 @@ class EpisodeRollouts:
             in_processes or config.env.step_seconds is not None,
             retries=config.env.retries,
             step_seconds=config.env.step_seconds,
-            proven=proven,
+            proven=proven or task.waits,  # it has been tried: what dies is the game
         )
         self._host = HostEnvs(pool)
         self._most = TESTS_AT_ONCE if self._env is not None else TESTS_AT_ONCE_ON_HOST
