@@ -271,7 +271,7 @@ class EnvConfig:
     for the population's fitness, stay in the task's own units."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
-    enough cores), and where steps have a time limit."""
+    enough cores), for games of StarCraft II, and where steps have a time limit."""
     retries: int = 3
     """How often an episode is played anew in a fresh environment when its environment fails (an
     error, a dead process, a step that takes too long), once the task has shown that it works."""
