@@ -322,6 +322,10 @@ def test_commit_and_version_of_smac(tmp_path: Path, sc2path: Path) -> None:
     (notes / "direct_url.json").write_text(json.dumps(source))
     found = starcraft.look("smac", written_python(tmp_path / "bin", tmp_path / "code"))
     assert (found.wrong, found.facts["code"]) == ("", "1.0.0, commit abc123")
+    notes.rename(tmp_path / notes.name)  # of another package, which is not the one that is found
+    both = Path(f"{tmp_path / 'code'}{os.pathsep}{tmp_path}")
+    found = starcraft.look("smac", written_python(tmp_path / "other", both))
+    assert (found.wrong, found.facts["code"]) == ("", "of unknown version")
 
 
 def test_what_is_missing_is_told_with_what_to_do(

@@ -14,7 +14,6 @@ import importlib.metadata
 import importlib.util
 import io
 import json
-import operator
 import os
 import platform
 import queue
@@ -33,6 +32,8 @@ import numpy as np
 _MARK = b"race"
 _LONGEST = 2**24  # bytes of a message's JSON
 _CLOSING_SECONDS = 4.0
+_SIZES = ("n_agents", "n_actions", "obs_shape", "state_shape", "episode_limit")
+_FACTS = ("battle_won", "episode_limit")
 
 
 class RefusedError(Exception):
@@ -135,16 +136,19 @@ def _game(configs: Any, version: str | None) -> dict[str, Any]:
 
 def _origin(package: str, place: str) -> str:
     """Version and commit of SMAC, as far as they can be known."""
-    version, commit = "of unknown version", ""
-    root = Path(place).parent
+    version, commit, root = "of unknown version", "", Path(place).parent
     if (root / ".git").exists():  # no folder above it: that may be another project's
         git = ["git", "-C", str(root), "rev-parse", "HEAD"]
-        commit = subprocess.run(git, stdout=subprocess.PIPE, check=False).stdout.decode().strip()
+        with contextlib.suppress(OSError):
+            done = subprocess.run(git, stdout=subprocess.PIPE, check=False)
+            commit = done.stdout.decode().strip()
     with contextlib.suppress(importlib.metadata.PackageNotFoundError, ValueError):
         found = importlib.metadata.distribution(package)
-        version = found.version
         told = json.loads(found.read_text("direct_url.json") or "{}")
-        commit = commit or told.get("vcs_info", {}).get("commit_id", "")
+        here = Path(str(found.locate_file(package))).resolve() == Path(place).resolve()
+        if here or told.get("dir_info", {}).get("editable"):  # else it is that of a namesake
+            version = found.version
+            commit = commit or told.get("vcs_info", {}).get("commit_id", "")
     return f"{version}, commit {commit}" if commit else version
 
 
@@ -199,7 +203,8 @@ class Battle:
         self._module = importlib.import_module(module)
         try:
             self._env = self._made(None)
-            self._sizes = {k: int(v) for k, v in self._env.get_env_info().items() if _is_whole(v)}
+            info = self._env.get_env_info()
+            self._sizes = {name: int(info[name]) for name in _SIZES}
         except Exception as error:
             raise RefusedError("arguments", text=_text(error)) from error
         version = self._arguments.get("game_version")
@@ -268,9 +273,6 @@ class Battle:
         }
 
 
-_FACTS = ("battle_won", "episode_limit")
-
-
 def _broke_down() -> None:
     error = sys.exc_info()[1]
     raise RefusedError("died", text=_text(error) if error else "")
@@ -283,14 +285,6 @@ def _reseed(distribution: Any, generators: Any) -> None:
             distribution.rng = np.random.default_rng(generators.spawn(1)[0])
         elif hasattr(value, "generate"):
             _reseed(value, generators)
-
-
-def _is_whole(value: Any) -> bool:
-    try:
-        operator.index(value)
-    except TypeError:
-        return False
-    return True
 
 
 def _text(error: BaseException) -> str:

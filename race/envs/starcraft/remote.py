@@ -2,13 +2,13 @@
 
 import contextlib
 import os
-import select
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from multiprocessing import connection
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, final
 
@@ -123,10 +123,7 @@ class Worker:
         self._busy = True
         try:
             game.send(self._process.stdin, message)
-            if (
-                seconds is not None
-                and not select.select([self._process.stdout], [], [], seconds)[0]
-            ):
+            if not connection.wait([self._process.stdout.fileno()], seconds):
                 raise EnvFailedError(
                     f"{self.python} did not answer within {seconds:g} seconds. Is it a Python that "
                     "can import SMAC?"
