@@ -265,6 +265,9 @@ class EnvConfig:
     reward_scale: float = 1.0
     """What rewards are multiplied by before anything is learned from them. Returns, in metrics and
     for the population's fitness, stay in the task's own units."""
+    normalise: bool = False
+    """Show networks every entry of what agents observe, and of the state, less its mean and divided
+    by its standard deviation over all that the run's teams have seen, within +-10."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
     enough cores), and where steps have a time limit."""
@@ -416,6 +419,7 @@ _BEFORE: dict[str, Any] = {
     "episode_limit": None,
     "largest_observation": 4096,
     "reward_scale": 1.0,
+    "normalise": False,
 }
 
 
