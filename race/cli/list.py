@@ -29,6 +29,8 @@ ALGORITHMS = {
 _OF_ONES_OWN = {
     "micro/PATH.toml": "a map of your own (docs/micro.md)",
     "pettingzoo:MODULE.ENV": "an environment of PettingZoo's interface (docs/environments.md)",
+    "jaxmarl:SMAX/MAP": "a battle of JaxMARL on the device (docs/environments.md)",
+    "jaxmarl:MPE/NAME": "a particle world of JaxMARL on the device, and its other environments",
     "MODULE:FUNCTION": "a task of your own (docs/environments.md)",
 }
 _EVOLUTIONS = {

@@ -233,7 +233,7 @@ Categories = Annotated[
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """What Multi-Agent MuJoCo shows, who is a team of PettingZoo's, where environments run."""
+    """What Multi-Agent MuJoCo shows, who is a team of others' environments, where these run."""
 
     agent_obsk: int = 0
     """Observe joints up to this distance; 0 is the agent's own joints only (Section 4.1)."""
@@ -245,21 +245,22 @@ class EnvConfig:
     library_observation: bool = False
     """Use gymnasium-robotics' own default observation instead of the three settings above."""
     kwargs: str = "{}"
-    """Arguments of the PettingZoo environment, as a JSON object, such as '{"N": 4}'."""
+    """Arguments of an environment of PettingZoo or JaxMARL, as a JSON object, such as
+    '{"N": 4}'."""
     agents: str = "*"
     """Its agents that are the team: patterns such as 'adversary_*', with commas in between."""
     others: str = "random"
     """What its other agents do: random, or package.module:function, which is called with (agent,
-    observation, action space, numpy generator) and returns an action."""
+    observation, action space, numpy generator) and returns an action (PettingZoo)."""
     team_reward: TeamReward = "mean"
     """What the team is paid: the mean or the sum of its agents' rewards. An agent that is not there
     gets 0."""
     state: StateSource = "auto"
-    """The global state: the environment's own (its state()), or the observations of all agents.
+    """The global state: the environment's own (state(), world_state), or what all agents observe.
     auto: its own, if there is one and it is not too large."""
     episode_limit: int | None = None
     """Steps after which an episode is cut off (truncated). None: what the environment calls
-    max_cycles."""
+    max_cycles or max_steps."""
     largest_observation: int = 4096
     """Most entries of what an agent observes, and of the environment's own state."""
     reward_scale: float = 1.0

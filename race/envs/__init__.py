@@ -1,4 +1,4 @@
-"""Tasks: Multi-Agent MuJoCo, battles, PettingZoo, probes with known answers, and your own.
+"""Tasks: Multi-Agent MuJoCo, battles, PettingZoo, JaxMARL, probes with answers, your own.
 
 A family of tasks may be added or changed here; whoever trains sees `race.types.AnyTask` alone.
 """
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from race.config.checks import check_env
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
-from race.envs import discrete_probe, mamujoco, own, pettingzoo, probe
+from race.envs import discrete_probe, jaxmarl, mamujoco, own, pettingzoo, probe
 from race.envs.own import factorised
 from race.errors import TaskError
 from race.types import AnyTask, DiscreteTask, Task
@@ -103,10 +103,10 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
         task_id: one of `task_ids`; any ``mamujoco/<Scenario>-<partition>`` that
             gymnasium-robotics knows; or your own as ``package.module:function``, where the
             function, called without arguments (or with `config`, if it takes one), returns a
-            `Task` or a `DiscreteTask`; or ``pettingzoo:MODULE.ENV``. Modules are also looked for in
-            the current directory.
-        config: what agents of Multi-Agent MuJoCo observe, and who is the team of a PettingZoo
-            environment; its defaults, if not given.
+            `Task` or a `DiscreteTask`; or ``pettingzoo:MODULE.ENV``, or ``jaxmarl:ENV``. Modules
+            are also looked for in the current directory.
+        config: what agents of Multi-Agent MuJoCo observe, and who is the team of an environment
+            of PettingZoo or JaxMARL; its defaults, if not given.
 
     Raises:
         TaskError: if there is no such task; the message names the nearest ones.
@@ -117,6 +117,8 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
         return make_discrete_task(task_id)
     if task_id.startswith(pettingzoo.PREFIX):
         return pettingzoo.make_task(task_id, config)
+    if task_id.startswith(jaxmarl.PREFIX):
+        return jaxmarl.make_task(task_id, config)
     if own.is_own(task_id):
         return own.own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
@@ -174,8 +176,8 @@ def reads_config(task_id: str) -> bool:
 
 
 def reads_team(task_id: str) -> bool:
-    """Whether a task that there is reads who is the team of a PettingZoo environment."""
-    return task_id.startswith(pettingzoo.PREFIX) or _own_reads_config(task_id)
+    """Whether a task that there is reads who is the team of an environment of others."""
+    return task_id.startswith((pettingzoo.PREFIX, jaxmarl.PREFIX)) or _own_reads_config(task_id)
 
 
 def _own_reads_config(task_id: str) -> bool:

@@ -60,6 +60,7 @@ def _of_spec(task: AnyTask, state: list[str], moved: list[str]) -> Layout:
     if not isinstance(spec, EnvSpec):
         each = ("",) * spec.obs_size, ("",) * spec.n_actions
         agents = tuple(f"agent {number}" for number in range(spec.n_agents))
+        agents = tuple(dict(task.facts).get("agent_names", agents))
         return Layout(
             agents, ("",) * spec.state_size, (each[0],) * len(agents), (each[1],) * len(agents)
         )

@@ -10,7 +10,7 @@ from race.config.effects import refuse_without_effect, setting, usual, without_e
 from race.config.files import Wanted, with_settings
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config
-from race.envs import pettingzoo, reads_config, reads_team
+from race.envs import jaxmarl, pettingzoo, reads_config, reads_team
 from race.envs.own import is_own
 from race.envs.trial import try_out
 from race.errors import ConfigError, say
@@ -97,7 +97,7 @@ def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
 
 def is_tried(task_id: str) -> bool:
     """Whether an environment of that name is looked at before it is trained on; others repeat."""
-    return is_own(task_id) or task_id.startswith(pettingzoo.PREFIX)
+    return is_own(task_id) or task_id.startswith((pettingzoo.PREFIX, jaxmarl.PREFIX))
 
 
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
@@ -114,6 +114,8 @@ def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     found: dict[str, Any] = {"repeats": trial.repeats, "conflict": trial.conflict}
     if task_id.startswith(pettingzoo.PREFIX):
         found["packages"] = pettingzoo.packages(task_id.removeprefix(pettingzoo.PREFIX))
+    if task_id.startswith(jaxmarl.PREFIX):
+        found["packages"] = jaxmarl.packages()
     return found
 
 
