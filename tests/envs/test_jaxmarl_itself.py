@@ -19,11 +19,16 @@ from race.config.settings import Config, EnvConfig, FacmacConfig
 from race.config.shape import shape_of
 from race.envs import make_task
 from race.envs.jaxmarl import source
+from race.errors import TaskError
 from race.learners.facmac import new_encoder
 from race.rollouts import device
 from race.rollouts.episodes import Part
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    # It says that there is a second version of it.
+    pytest.mark.filterwarnings("ignore:OvercookedV2 is now:DeprecationWarning"),
+]
 pytest.importorskip("jaxmarl", reason="pip install 'race-marl[jaxmarl]'")
 
 
@@ -38,7 +43,7 @@ NAMES = [
     *("SMAX/2s3z", "SMAX/3m", "SMAX/smacv2_5_units", "SMAX"),
     *("MPE/simple_spread_v3", "MPE/simple_tag_v3", "MPE/simple_speaker_listener_v4"),
     *("MPE/simple_reference_v3", "overcooked/cramped_room", "overcooked_v2"),
-    *("switch_riddle", "coin_game", "hanabi", "storm"),
+    *("switch_riddle", "coin_game", "hanabi"),
 ]
 
 
@@ -109,6 +114,20 @@ def test_a_run_on_the_device_from_the_shell(tmp_path: Path) -> None:
     main(["evaluate", str(path), "--episodes", "4"])
     main(["export", str(path), "--out", str(tmp_path / "team.safetensors")])
     main(["describe", "jaxmarl:SMAX/3m"])
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("storm", "nothing by the name of agent 0"),
+        ("MPE/simple_facmac_v1", "Discrete"),
+        ("hanabi", r"--env\.episode-limit"),
+        ("SMAX/2s4z", "jaxmarl:SMAX/2s3z"),
+    ],
+)
+def test_what_cannot_be_learned_is_told(name: str, words: str) -> None:
+    with pytest.raises(TaskError, match=words):
+        make_task(f"jaxmarl:{name}")
 
 
 def test_a_picked_team_and_arguments() -> None:

@@ -63,6 +63,12 @@ class Adapter:
         self.team = list(map(str, self._members))
         self._counts = {agent: self._count(agent) for agent in self._agents}
         shown, inner = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((2,), np.uint32))
+        unseen = [agent for agent in self._agents if agent not in shown]
+        if unseen:
+            raise self._wrong(
+                f"its reset shows {', '.join(map(str, shown))}, and nothing by the name of agent "
+                f"{unseen[0]}: it has not the interface of JaxMARL's other environments"
+            )
         sizes = {agent: math.prod(shown[agent].shape) for agent in self._agents}
         self._own_state = _own_state(shown, config, task)
         self._mask = _mask_of(env, inner)
