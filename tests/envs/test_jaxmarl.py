@@ -22,6 +22,7 @@ from race.envs.trial import try_out
 from race.errors import RenderError, TaskError
 from race.rollouts import device
 from race.rollouts.episodes import Part
+from race.training import asking
 from race.types import DiscreteTask
 
 BLUE = EnvConfig(agents="blue_*")
@@ -282,3 +283,21 @@ def test_an_old_or_missing_jaxmarl_is_told(monkeypatch: pytest.MonkeyPatch) -> N
     with pytest.raises(TaskError, match=f"jaxmarl is not installed: {pip}"):
         make_task("jaxmarl:SMAX/6m", BLUE)
     assert jaxmarl.PREFIX == "jaxmarl:"
+
+
+def test_what_is_printed_at_the_import_is_kept_back(capsys: pytest.CaptureFixture[str]) -> None:
+    there = sys.stdout, sys.stderr, sys.__stdout__
+    with source._quiet():
+        print("one")
+        sys.stdout, sys.stderr = sys.__stdout__, sys.__stderr__  # type: ignore[assignment]
+        print("two")
+    assert (sys.stdout, sys.stderr, sys.__stdout__) == there
+    assert capsys.readouterr().out == ""
+
+
+def test_metadata_has_the_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    registry(monkeypatch)
+    monkeypatch.setattr(conflict, "_STEPS", 3)
+    monkeypatch.setattr(jaxmarl, "packages", lambda: {"jaxmarl": "0.2.0"})
+    found = asking.tried("jaxmarl:MPE/simple_spread_v3", make_task("jaxmarl:MPE/simple_spread_v3"))
+    assert found == {"repeats": True, "conflict": None, "packages": {"jaxmarl": "0.2.0"}}

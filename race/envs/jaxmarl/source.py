@@ -5,6 +5,8 @@ import difflib
 import importlib.metadata
 import io
 import json
+import sys
+from collections.abc import Iterator
 from typing import Any, Final
 
 from race.errors import TaskError, described
@@ -83,7 +85,7 @@ def names(jaxmarl: Any) -> list[str]:
 def _library(name: str) -> Any:
     where, pip = f"Task {PREFIX}{name}", "pip install 'race-marl[jaxmarl]'"
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # it says what else is not installed
+        with _quiet():
             import jaxmarl
     except ModuleNotFoundError as error:
         if error.name == "jaxmarl":
@@ -100,6 +102,21 @@ def _library(name: str) -> Any:
             f"means something else than that of {'.'.join(map(str, OLDEST))} and later: {pip}"
         )
     return jaxmarl
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keeps back what is printed while jaxmarl is imported: what else is not installed.
+
+    It also puts `sys.__stdout__` and `sys.__stderr__` in the places of whatever was there.
+    """
+    before, stderr = sys.__stdout__, sys.stderr
+    with contextlib.redirect_stdout(io.StringIO()) as kept:
+        sys.__stdout__ = kept  # type: ignore[misc, assignment]
+        try:
+            yield
+        finally:
+            sys.__stdout__, sys.stderr = before, stderr  # type: ignore[misc]
 
 
 def _number(version: str) -> tuple[int, ...]:
