@@ -7,6 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium
 
+from race.envs import jaxmarl
 from race.envs.pettingzoo import TeamEnv
 from race.envs.pettingzoo.vectors import Choices, Sight, leaves, named
 from race.types import AnyTask, EnvSpec
@@ -47,6 +48,9 @@ def layout(task_id: str, task: AnyTask) -> Layout:
             return _of_team(env)
         if task_id.startswith("mamujoco/"):
             state, moved = _of_robot(env)
+        elif task_id.startswith(jaxmarl.PREFIX) and env.names is not None:
+            shown, *each = env.names
+            return Layout(tuple(env.team), tuple(shown), *(tuple(map(tuple, one)) for one in each))
         else:
             state, moved = _flattened(env), []
     finally:

@@ -127,6 +127,18 @@ def test_other_agents_choose_at_random_what_they_can() -> None:
     assert moved == {True, False}
 
 
+class Idle(Duel):
+    """Its enemy never fights."""
+
+    def step_env(self, key: Any, battle: Any, actions: Any) -> Any:
+        return super().step_env(key, battle, actions | {"enemy_0": np.int32(0)})
+
+
+@cache
+def duel(team: str) -> DiscreteTask:
+    return jaxmarl_task(Idle if team == "ally_*" else Duel, "duel", EnvConfig(agents=team))
+
+
 @pytest.mark.parametrize(
     ("team", "actions", "end"),
     [
@@ -137,23 +149,14 @@ def test_other_agents_choose_at_random_what_they_can() -> None:
     ],
 )
 def test_battles_are_won_by_the_team_that_is_left(team: str, actions: Any, end: Any) -> None:
-    class Idle(Duel):
-        """Its enemy never fights unless it is of the team."""
-
-        def step_env(self, key: Any, battle: Any, actions: Any) -> Any:
-            if team != "*":
-                actions = actions | {"enemy_0": np.int32(0)}
-            return super().step_env(key, battle, actions)
-
-    task = jaxmarl_task(Idle, "duel", EnvConfig(agents=team))
+    task = duel(team)
     assert task.spec.has_wins == (team != "*")
     *_, last = played(task, actions)
     assert (*last[2:4], last[4]["battle_won"]) == end
 
 
 def test_a_decision_in_the_last_step_is_no_time_limit() -> None:
-    task = jaxmarl_task(Duel, "duel", EnvConfig())
-    *_, last = played(task, [[0, 0, 0], [0, 0, 0], [0, 2, 0]])
+    *_, last = played(duel("*"), [[0, 0, 0], [0, 0, 0], [0, 2, 0]])
     assert last[2:4] == (True, False)
 
 

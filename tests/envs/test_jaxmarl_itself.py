@@ -19,6 +19,7 @@ from race.config.settings import Config, EnvConfig, FacmacConfig
 from race.config.shape import shape_of
 from race.envs import make_task
 from race.envs.jaxmarl import source
+from race.envs.layout import layout
 from race.errors import TaskError
 from race.learners.facmac import new_encoder
 from race.rollouts import device
@@ -77,6 +78,43 @@ def test_episodes_are_those_that_jaxmarl_plays(name: str) -> None:
             assert info["battle_won"] == (reward >= 1)
     assert steps <= task.spec.episode_limit
     assert (steps == task.spec.episode_limit) or terminated
+
+
+def test_names_are_those_of_what_is_shown() -> None:
+    task: Any = make_task("jaxmarl:SMAX/2s3z")
+    names, env = layout("jaxmarl:SMAX/2s3z", task), task.make(None)
+    assert names.agents == tuple(f"ally_{i}" for i in range(5))
+    assert len(names.state) == task.spec.state_size
+    assert {len(obs) for obs in names.obs} == {task.spec.obs_size}
+    assert {len(actions) for actions in names.actions} == {task.spec.n_actions}
+    seen = env.reset(seed=1)[0]
+    own, state = dict(zip(names.obs[3], seen["obs"][3], strict=True)), names.state
+    assert own["own health"] == own["ally_0: health"] == 1
+    assert own["own unit_type_bit_3"] == own["ally_4: unit_type_bits_3"] == 1  # zealots
+    assert own["ally_0: unit_type_bits_2"] == 1  # a stalker
+    whole = dict(zip(state, seen["state"], strict=True))
+    assert (whole["enemy_4: team"], whole["enemy_4: type"], whole["ally_0: team"]) == (1, 3, 0)
+    # Moves go where they are called.
+    for name, axis, sign in (("north", 1, 1), ("east", 0, 1), ("south", 1, -1), ("west", 0, -1)):
+        env.reset(seed=1)
+        actions = np.full(5, names.actions[0].index("stop"))
+        actions[0] = names.actions[0].index(name)
+        after = dict(zip(state, env.step(actions)[0]["state"], strict=True))
+        place = f"ally_0: position_{'xy'[axis]}"
+        assert np.sign(after[place] - whole[place]) == sign
+    # An enemy can be attacked once it is near: the nearest first.
+    env.reset(seed=1)
+    for _ in range(8):
+        seen = env.step(np.full(5, names.actions[0].index("east")))[0]
+        shown = dict(zip(state, seen["state"], strict=True))
+        near = seen["avail_actions"][0]
+        at = np.array([shown[f"ally_0: position_{c}"] for c in "xy"])
+        for k, name in enumerate(names.actions[0]):
+            if name.startswith("attack") and shown["ally_0: health"] > 0:
+                enemy = name.removeprefix("attack ")
+                there = np.array([shown[f"{enemy}: position_{c}"] for c in "xy"])
+                reach = shown[f"{enemy}: health"] > 0 and np.linalg.norm(there - at) < 6
+                assert bool(near[k]) == reach
 
 
 @pytest.mark.parametrize("name", ["SMAX/3m", "MPE/simple_spread_v3"])

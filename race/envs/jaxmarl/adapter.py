@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from race.config.settings import EnvConfig
+from race.envs.jaxmarl.naming import names_of
 from race.errors import TaskError
 from race.types import DiscreteSpec, Observation, Outcome
 
@@ -145,6 +146,13 @@ class Adapter:
             won=won,
         )
         return State(inner, steps), self._observed(shown, inner), outcome, paid
+
+    def names(self) -> tuple[list[str], list[list[str]], list[list[str]]] | None:
+        """Names of the entries of the state, and of each agent's observation and actions."""
+        found = names_of(self._env, self._members)
+        if found is None or self._own_state:
+            return found
+        return [""] * self.spec.state_size, *found[1:]
 
     def _observed(self, shown: Any, inner: Any) -> Observation:
         obs = jnp.stack([_padded(shown[agent], self.spec.obs_size) for agent in self._members])

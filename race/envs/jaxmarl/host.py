@@ -24,6 +24,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
     Attributes:
         team: names of the team's agents.
         paid: what each of them was paid in the newest step.
+        names: of the entries of the state, and of each agent's observation and actions, if known.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": []}  # type: ignore[misc]
@@ -49,7 +50,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             }
         )
         self.action_space = spaces.MultiDiscrete([spec.n_actions] * n)
-        self._adapter = adapter
+        self._adapter, self.names = adapter, adapter.names()
         self._key: Any = None
         self._state: State | None = None
 
