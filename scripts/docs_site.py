@@ -24,6 +24,7 @@ ABOVE = {
 MODULES = (
     ("race.envs", ("make_task", "task_ids", "describe_tasks", "TaskInfo", "factorised")),
     ("race.envs.pettingzoo", ("parallel_task",)),
+    ("race.envs.jaxmarl", ("jaxmarl_task",)),
     ("race.envs.pymarl", ("pymarl_task",)),
     ("race.envs.micro", None),
     ("race.types", None),

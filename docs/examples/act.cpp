@@ -53,6 +53,10 @@ class Weights {
     return array;
   }
 
+  bool has(const std::string& name) const {
+    return header_.find("\"" + name + "\":{") != std::string::npos;
+  }
+
   bool layer_norm() const { return header_.find("\"layer_norm\":\"1\"") != std::string::npos; }
 
  private:
@@ -98,6 +102,9 @@ int main(int count, char** words) try {
   const Array head = weights("head.weight"), head_bias = weights("head.bias");
   const Array joint = weights("joint"), low = weights("low"), high = weights("high");
   const size_t agents = head.shape[0], obs_size = hidden.shape[1];
+  const bool scaled = weights.has("obs.mean");
+  const Array mean = scaled ? weights("obs.mean") : Array();
+  const Array factor = scaled ? weights("obs.factor") : Array();
   for (std::string line; std::getline(std::cin, line);) {
     std::stringstream text(line);
     std::vector<float> all;
@@ -105,6 +112,11 @@ int main(int count, char** words) try {
       std::vector<float> obs(obs_size);
       for (float& value : obs)
         if (!(text >> value)) throw std::runtime_error("a line has too few numbers");
+      for (size_t entry = 0; scaled && entry < obs_size; ++entry) {
+        const size_t at = agent * obs_size + entry;
+        const float apart = (obs[entry] - mean.values[at]) * factor.values[at];
+        obs[entry] = std::fmin(std::fmax(apart, -10.0f), 10.0f);
+      }
       const std::vector<float> first = layer(obs, hidden, hidden_bias, agent, norm);
       const std::vector<float> z = layer(first, out, out_bias, agent, norm);
       const std::vector<float> action = layer(z, head, head_bias, agent, false);

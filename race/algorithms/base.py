@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from race.algorithms.population import Population
+from race.method.normalisation import Scaling
 
 Losses = dict[str, Float[Array, ""]]
 
@@ -19,6 +20,7 @@ class Teams(eqx.Module):
     encoder: Any  # of all teams; or with a leading axis T, then one for each agent of each team
     heads: Float[Array, "T N H1 A"]
     own_encoders: bool = eqx.field(static=True, default=False)
+    scaling: Scaling | None = None  # of what environments show them; None: as it is
 
     @property
     def count(self) -> int:
@@ -36,7 +38,7 @@ class Teams(eqx.Module):
         encoder = self.encoder
         if self.own_encoders:
             encoder = jax.tree.map(lambda leaf: leaf[places], encoder)
-        return Teams(encoder, self.heads[places], self.own_encoders)
+        return Teams(encoder, self.heads[places], self.own_encoders, self.scaling)
 
 
 class Tested(NamedTuple):

@@ -29,6 +29,8 @@ ALGORITHMS = {
 _OF_ONES_OWN = {
     "micro/PATH.toml": "a map of your own (docs/micro.md)",
     "pettingzoo:MODULE.ENV": "an environment of PettingZoo's interface (docs/environments.md)",
+    "jaxmarl:SMAX/MAP": "a battle of JaxMARL on the device (docs/environments.md)",
+    "jaxmarl:MPE/NAME": "a particle world of JaxMARL on the device, and its other environments",
     "smac/MAP": "StarCraft II itself through SMAC, such as smac/2s3z (docs/starcraft.md)",
     "smacv2/RACE_N_vs_M": "the same through SMACv2, such as smacv2/protoss_5_vs_5",
     "MODULE:FUNCTION": "a task of your own (docs/environments.md)",

@@ -43,7 +43,7 @@ class Train:
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """The task, such as mamujoco/HalfCheetah-2x3 or micro/2s3z (`race list` shows all),
-    pettingzoo:MODULE.ENV, smac/2s3z, or package.module:function for your own."""
+    pettingzoo:MODULE.ENV, jaxmarl:ENV, smac/2s3z, or package.module:function for your own."""
     algo: Algo = "race"
     """race, or a baseline: with a population of whole networks (merl, ea) or without one."""
     base: Base | None = None

@@ -145,7 +145,7 @@ def _idle(
         why = "with --env.library-observation, which chooses for itself"
         yield from ((f"env.{name}", why) for name in _OBSERVATION)
     if not reads_parallel:
-        why = f"on {asked.task}, which is no PettingZoo task"
+        why = f"on {asked.task}, which is no PettingZoo or JaxMARL task"
         yield from ((f"env.{name}", why) for name in _PARALLEL)
     if not reads_game:
         yield "env.python", f"on {asked.task}, which is no game of StarCraft II"

@@ -233,7 +233,7 @@ Categories = Annotated[
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """What Multi-Agent MuJoCo shows, who is a team of PettingZoo's, where environments run."""
+    """What Multi-Agent MuJoCo shows, who is a team of others' environments, where these run."""
 
     agent_obsk: int = 0
     """Observe joints up to this distance; 0 is the agent's own joints only (Section 4.1)."""
@@ -245,7 +245,7 @@ class EnvConfig:
     library_observation: bool = False
     """Use gymnasium-robotics' own default observation instead of the three settings above."""
     kwargs: str = "{}"
-    """Arguments of the PettingZoo environment, or of SMAC's, as a JSON object, such as
+    """Arguments of an environment of PettingZoo, JaxMARL or SMAC, as a JSON object, such as
     '{"N": 4}'."""
     python: str | None = None
     """Of smac/* and smacv2/*: the interpreter in which SMAC is installed, which need not have
@@ -254,21 +254,24 @@ class EnvConfig:
     """Its agents that are the team: patterns such as 'adversary_*', with commas in between."""
     others: str = "random"
     """What its other agents do: random, or package.module:function, which is called with (agent,
-    observation, action space, numpy generator) and returns an action."""
+    observation, action space, numpy generator) and returns an action (PettingZoo)."""
     team_reward: TeamReward = "mean"
     """What the team is paid: the mean or the sum of its agents' rewards. An agent that is not there
     gets 0."""
     state: StateSource = "auto"
-    """The global state: the environment's own (its state()), or the observations of all agents.
+    """The global state: the environment's own (state(), world_state), or what all agents observe.
     auto: its own, if there is one and it is not too large."""
     episode_limit: int | None = None
     """Steps after which an episode is cut off (truncated). None: what the environment calls
-    max_cycles."""
+    max_cycles or max_steps."""
     largest_observation: int = 4096
     """Most entries of what an agent observes, and of the environment's own state."""
     reward_scale: float = 1.0
     """What rewards are multiplied by before anything is learned from them. Returns, in metrics and
     for the population's fitness, stay in the task's own units."""
+    normalise: bool = False
+    """Show networks every entry of what agents observe, and of the state, less its mean and divided
+    by its standard deviation over all that the run's teams have seen, within +-10."""
     processes: bool | None = None
     """Run each environment in a process of its own. None: where it pays (slow physics and
     enough cores), for games of StarCraft II, and where steps have a time limit."""
@@ -421,6 +424,7 @@ _BEFORE: dict[str, Any] = {
     "episode_limit": None,
     "largest_observation": 4096,
     "reward_scale": 1.0,
+    "normalise": False,
 }
 
 

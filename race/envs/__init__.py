@@ -1,4 +1,4 @@
-"""Tasks: Multi-Agent MuJoCo, battles, StarCraft II, PettingZoo, probes, and your own.
+"""Tasks: Multi-Agent MuJoCo, battles, StarCraft II, PettingZoo, JaxMARL, probes, your own.
 
 A family of tasks may be added or changed here; whoever trains sees `race.types.AnyTask` alone.
 """
@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from race.config.checks import check_env
 from race.config.presets import TABLE_4
 from race.config.settings import EnvConfig
-from race.envs import discrete_probe, mamujoco, own, pettingzoo, probe, starcraft
+from race.envs import discrete_probe, jaxmarl, mamujoco, own, pettingzoo, probe, starcraft
 from race.envs.own import factorised
 from race.errors import TaskError
 from race.types import AnyTask, DiscreteTask, Task
@@ -104,10 +104,11 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
         task_id: one of `task_ids`; any ``mamujoco/<Scenario>-<partition>`` that
             gymnasium-robotics knows; or your own as ``package.module:function``, where the
             function, called without arguments (or with `config`, if it takes one), returns a
-            `Task` or a `DiscreteTask`; or ``pettingzoo:MODULE.ENV``. Modules are also looked for in
-            the current directory. Or ``smac/<map>``, ``smacv2/<race>_<n>_vs_<m>``.
-        config: what agents of Multi-Agent MuJoCo observe, who is the team of a PettingZoo
-            environment, and who plays StarCraft II; its defaults, if not given.
+            `Task` or a `DiscreteTask`; or ``pettingzoo:MODULE.ENV``, or ``jaxmarl:ENV``. Modules
+            are also looked for in the current directory. Or ``smac/<map>``, or
+            ``smacv2/<race>_<n>_vs_<m>``.
+        config: what agents of Multi-Agent MuJoCo observe, who is the team of an environment of
+            PettingZoo or JaxMARL, and who plays StarCraft II; its defaults, if not given.
 
     Raises:
         TaskError: if there is no such task; the message names the nearest ones.
@@ -120,6 +121,8 @@ def make_task(task_id: str, config: EnvConfig = _DEFAULT) -> AnyTask:
         return pettingzoo.make_task(task_id, config)
     if starcraft.is_game(task_id):
         return starcraft.make_task(task_id, config)
+    if task_id.startswith(jaxmarl.PREFIX):
+        return jaxmarl.make_task(task_id, config)
     if own.is_own(task_id):
         return own.own_task(task_id, config)
     if task_id.startswith("mamujoco/"):
@@ -177,8 +180,8 @@ def reads_config(task_id: str) -> bool:
 
 
 def reads_team(task_id: str) -> bool:
-    """Whether a task that there is reads who is the team of a PettingZoo environment."""
-    return task_id.startswith(pettingzoo.PREFIX) or _own_reads_config(task_id)
+    """Whether a task that there is reads who is the team of an environment of others."""
+    return task_id.startswith((pettingzoo.PREFIX, jaxmarl.PREFIX)) or _own_reads_config(task_id)
 
 
 def reads_game(task_id: str) -> bool:

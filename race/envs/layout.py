@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 import gymnasium
 
-from race.envs import starcraft
+from race.envs import jaxmarl, starcraft
 from race.envs.pettingzoo import TeamEnv
 from race.envs.pettingzoo.vectors import Choices, Sight, leaves, named
 from race.errors import TaskError
@@ -51,6 +51,9 @@ def layout(task_id: str, task: AnyTask) -> Layout:
             return _of_game(task_id, env)
         if task_id.startswith("mamujoco/"):
             state, moved = _of_robot(env)
+        elif task_id.startswith(jaxmarl.PREFIX) and env.names is not None:
+            shown, *each = env.names
+            return Layout(tuple(env.team), tuple(shown), *(tuple(map(tuple, one)) for one in each))
         else:
             state, moved = _flattened(env), []
     finally:
@@ -64,6 +67,7 @@ def _of_spec(task: AnyTask, state: list[str], moved: list[str]) -> Layout:
     if not isinstance(spec, EnvSpec):
         each = ("",) * spec.obs_size, ("",) * spec.n_actions
         agents = tuple(f"agent {number}" for number in range(spec.n_agents))
+        agents = tuple(dict(task.facts).get("agent_names", agents))
         return Layout(
             agents, ("",) * spec.state_size, (each[0],) * len(agents), (each[1],) * len(agents)
         )

@@ -19,7 +19,7 @@ from race.types import AnyTask, DiscreteTask, EnvSpec, Name, Task, Whole
 
 def is_own(task_id: str) -> bool:
     """Whether an id names a function of a module of the user's."""
-    return re.fullmatch(r"(?!pettingzoo:)[\w.]+:\w+", task_id) is not None
+    return re.fullmatch(r"(?!pettingzoo:|jaxmarl:)[\w.]+:\w+", task_id) is not None
 
 
 def own_function(task_id: str) -> Callable[..., Any]:

@@ -17,8 +17,10 @@ from race.algorithms.base import Losses, Teams
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import LEARNERS
+from race.method.normalisation import Scaling, scaled
 from race.networks.dense import act_teams
 from race.replay.buffer import Layout, Replay, distinct_places, insert, sample, slots_of
+from race.replay.shown import as_shown
 from race.types import EnvSpec, Spec
 
 TRACES: Counter[str] = Counter()
@@ -52,11 +54,13 @@ def learn(
     spec: Spec,
     shape: Shape,
     layouts: Layout | None = None,
+    scaling: Scaling | None = None,
 ) -> tuple[Any, Losses]:
     """Gradient steps ``first_step`` to ``first_step + n_steps - 1`` of a run, in one program.
 
     The randomness of a step depends on ``key`` and the step's number alone, so that steps may be
     split over calls in any way. Minibatches of episodes are those of the ``layouts``, one a step.
+    The buffer holds what environments showed; ``scaling`` says how networks see it.
 
     Returns:
         The state and ``sums`` with the steps' losses added.
@@ -71,6 +75,7 @@ def learn(
             batch = sample(replay, shape.batch_size, sample_key)
         else:
             batch = slots_of(replay, jax.tree.map(lambda column: column[i], layouts))
+        batch = as_shown(batch, scaling)
         state, critic, policy = algorithm.update(state, batch, step, update_key, spec, shape, hyper)
         losses = critic | policy
         return state, {name: sums[name] + losses[name] for name in sums}
@@ -153,6 +158,8 @@ def joint_actions(
     teams: Teams, state: Float[Array, "T S"], *, spec: EnvSpec, base: str
 ) -> Float[Array, "T U"]:
     """What `act` compiles."""
+    if teams.scaling is not None:
+        state = scaled(state, teams.scaling.state)
     encode = LEARNERS[base].encode
     if not teams.own_encoders:
         return act_teams(encode(teams.encoder, state, spec), teams.heads, spec)

@@ -15,8 +15,10 @@ from race.algorithms import Algorithm
 from race.algorithms.base import Losses, Teams
 from race.config.hyper import Hyper
 from race.config.shape import Shape
+from race.method.normalisation import Scaling
 from race.programs import TRACES, joint_actions
 from race.replay.buffer import Layout, Replay, sample, slots_of
+from race.replay.shown import as_shown
 from race.types import EnvSpec, Slots, Spec
 
 
@@ -31,7 +33,13 @@ stack = jax.jit(stacked)
 
 @partial(jax.jit, static_argnames=("room", "shape"))
 def minibatches(
-    replay: Replay, key: PRNGKeyArray, first_step: Int[Any, ""], *, room: int, shape: Shape
+    replay: Replay,
+    key: PRNGKeyArray,
+    first_step: Int[Any, ""],
+    *,
+    room: int,
+    shape: Shape,
+    scaling: Scaling | None = None,
 ) -> Any:
     """The minibatches of gradient steps from ``first_step`` on, ``room`` of them.
 
@@ -41,16 +49,16 @@ def minibatches(
 
     def one(i: Int[Array, ""]) -> Any:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        return sample(replay, shape.batch_size, sample_key)
+        return as_shown(sample(replay, shape.batch_size, sample_key), scaling)
 
     return jax.vmap(one)(jnp.arange(room))
 
 
 @jax.jit
-def minibatches_of(replay: Replay, layouts: Layout) -> Slots:
+def minibatches_of(replay: Replay, layouts: Layout, scaling: Scaling | None = None) -> Slots:
     """The minibatches of episodes of some layouts, one a step."""
     TRACES["minibatches"] += 1
-    slots: Slots = jax.vmap(slots_of, (None, 0))(replay, layouts)
+    slots: Slots = as_shown(jax.vmap(slots_of, (None, 0))(replay, layouts), scaling)
     return slots
 
 

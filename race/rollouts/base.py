@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from race.algorithms.base import Teams
 from race.config.settings import Config
 from race.errors import DivergenceError
+from race.method.normalisation import Observed, Scaling
 from race.replay.buffer import Replay
 
 Steps = Callable[[int], None]
@@ -63,6 +64,8 @@ class Trial(NamedTuple):
     encoder: Any
     heads: Mapping[str, Float[Array, "N H1 A"]]
     seeds: NDArray[np.int64]
+    scaling: Scaling | None = None
+    """Of what environments show the teams; None: as it is."""
 
 
 class Generation(NamedTuple):
@@ -72,6 +75,17 @@ class Generation(NamedTuple):
     env_steps: int
     repeated: int
     """Episodes that were begun anew because an environment failed."""
+    observed: Observed | None = None
+    """What all teams saw, where observations are normalised."""
+
+
+class WarmUp(NamedTuple):
+    """What the random episodes before the first generation came to."""
+
+    replay: Replay
+    env_steps: int
+    observed: Observed | None = None
+    """What was seen, where observations are normalised and anything was."""
 
 
 @runtime_checkable
@@ -92,11 +106,11 @@ class Rollouts(Protocol):
 
     def warm_up(
         self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
-    ) -> tuple[Replay, int] | None:
+    ) -> WarmUp | None:
         """Random episodes of one run before its first generation.
 
         Returns:
-            The buffer and the steps made; None if it was interrupted.
+            What it came to; None if it was interrupted.
 
         Raises:
             TaskError: if an environment fails, or hands over what it may not.

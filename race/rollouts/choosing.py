@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from race.algorithms.base import Teams
 from race.learners.facmac import logits
 from race.method.exploration import explore, greedy
+from race.method.normalisation import scaled
 from race.networks.recurrent import embed_step, no_memory
 from race.types import Observation
 
@@ -47,7 +48,11 @@ def choose(
         how: None if nobody explores.
     """
     embed = jax.vmap(embed_step) if teams.own_encoders else embed_step
-    z = embed(teams.encoder, memory.carry, seen.obs, memory.last_action)
+    obs = seen.obs
+    if teams.scaling is not None:
+        assert teams.scaling.obs is not None
+        obs = scaled(obs, teams.scaling.obs)
+    z = embed(teams.encoder, memory.carry, obs, memory.last_action)
     scores = jax.vmap(logits)(z, teams.heads)
     action = greedy(scores, seen.avail_actions)
     if how is not None:

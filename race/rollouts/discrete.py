@@ -15,12 +15,13 @@ from race.algorithms.base import Teams
 from race.config.settings import Config
 from race.errors import DivergenceError
 from race.method.exploration import epsilon
+from race.method.normalisation import Scaling
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Replay, init_replay
 from race.rollouts import device
-from race.rollouts.base import Generation, Play, Score, Steps, Trial, check_returns
+from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp, check_returns
 from race.rollouts.choosing import Exploration
-from race.rollouts.episodes import Part, Played, empty_episode
+from race.rollouts.episodes import Part, Played, empty_episode, seen_in
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
 from race.types import DiscreteTask
@@ -82,9 +83,9 @@ class EpisodeRollouts:
 
     def warm_up(
         self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
-    ) -> tuple[Replay, int] | None:
+    ) -> WarmUp | None:
         """There is none: exploration begins with many random actions."""
-        return replay, 0
+        return WarmUp(replay, 0)
 
     def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
         """MARL teams choose at random now and then; populations explore by their diversity."""
@@ -105,7 +106,8 @@ class EpisodeRollouts:
                 replay = programs.store(replay, episodes, np.int32(play.teams.count))
             returns = np.asarray(played.episode_return, np.float64)
             steps = int(np.sum(played.episodes.length))
-            results.append((replay, Generation(returns, steps, now - before)))
+            observed = seen_in(played.episodes) if play.config.env.normalise else None
+            results.append((replay, Generation(returns, steps, now - before, observed)))
             before = now
         return results
 
@@ -114,7 +116,11 @@ class EpisodeRollouts:
         longest = max(len(trial.seeds) for trial in trials)
         size = self._tests = max(self._tests, min(longest, self._most))
         everyone = [
-            Teams(t.encoder, jnp.repeat(jnp.stack(list(t.heads.values())), size, axis=0))
+            Teams(
+                t.encoder,
+                jnp.repeat(jnp.stack(list(t.heads.values())), size, axis=0),
+                scaling=t.scaling,
+            )
             for t in trials
         ]
         found: list[list[Any]] = [[] for _ in trials]
@@ -142,9 +148,16 @@ class EpisodeRollouts:
             for i, name in enumerate(trial.heads)
         }
 
-    def episode(self, encoder: Any, head: Float[Array, "N H1 A"], seed: int) -> NDArray[np.int32]:
+    def episode(
+        self,
+        encoder: Any,
+        head: Float[Array, "N H1 A"],
+        seed: int,
+        scaling: Scaling | None = None,
+    ) -> NDArray[np.int32]:
         """The actions of one episode of a team without exploration, [steps, N]."""
-        part = Part(Teams(encoder, head[None]), _small(np.array([seed])), None)
+        team = Teams(encoder, head[None], scaling=scaling)
+        part = Part(team, _small(np.array([seed])), None)
         ((played, _),) = self._episodes([part])
         steps = int(played.episodes.length[0])
         return np.asarray(played.episodes.action[0, :steps]).astype(np.int32)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from race.algorithms.base import Teams
+from race.method.normalisation import Observed, running_of
 from race.rollouts.choosing import Exploration
 from race.types import DiscreteSpec, Episode
 
@@ -50,3 +51,11 @@ def no_episodes(teams: int, spec: DiscreteSpec, precision: str) -> Played:
     """Nothing played yet, on the device."""
     episodes = Episode(*map(jnp.asarray, empty_episode(spec, precision, teams)))
     return Played(episodes, jnp.zeros(teams), jnp.zeros(teams, bool))
+
+
+def seen_in(episodes: Episode) -> Observed:
+    """What the teams of some episodes saw whenever they chose an action."""
+    lengths = np.asarray(episodes.length)
+    chose = np.arange(np.shape(episodes.reward)[1])[None] < lengths[:, None]
+    obs, state = (np.asarray(x)[:, :-1][chose] for x in (episodes.obs, episodes.state))
+    return Observed(running_of(obs), running_of(state))

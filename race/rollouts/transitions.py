@@ -13,10 +13,11 @@ from race import programs
 from race.algorithms.base import Teams
 from race.config.settings import Config
 from race.errors import DivergenceError
+from race.method.normalisation import Observed, observed_more, running_of
 from race.programs import cohort
 from race.randomness import Purpose, host_seeds
 from race.replay.buffer import Replay, init_replay
-from race.rollouts.base import Generation, Play, Score, Steps, Trial
+from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp
 from race.rollouts.host import collect
 from race.rollouts.pool import EnvPool
 from race.types import EnvSpec, Rollout, Task, Transition
@@ -87,10 +88,11 @@ class TransitionRollouts:
 
     def warm_up(
         self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
-    ) -> tuple[Replay, int] | None:
+    ) -> WarmUp | None:
         """Uniform actions, exactly as many steps as asked for; none where nothing learns."""
         spec = self._task.spec
         collected, index = 0, 0
+        observed: Observed | None = None
         while config.has_marl and collected < config.learner.random_steps:
             if interrupted():
                 return None
@@ -111,9 +113,11 @@ class TransitionRollouts:
 
             rollout = collect(self._pool, choose, seeds[:-1], max_ticks=missing // playing)
             replay = store(replay, scaled(rollout.transitions, config.env.reward_scale))
+            now = seen_by(rollout, config)
+            observed = now if observed is None or now is None else observed_more(observed, now)
             collected += len(rollout.transitions.reward)
             index += 1
-        return replay, collected
+        return WarmUp(replay, collected, observed)
 
     def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
         """All tick together. MARL teams' actions are noisy; populations explore by diversity."""
@@ -128,7 +132,9 @@ class TransitionRollouts:
                 scale = play.config.env.reward_scale
                 replay = store(replay, scaled(played.transitions, scale))
             steps, repeated = len(played.transitions.reward), int(played.repeated.sum())
-            results.append((replay, Generation(played.episode_return, steps, repeated)))
+            observed = seen_by(played, play.config)
+            made = Generation(played.episode_return, steps, repeated, observed)
+            results.append((replay, made))
         return results
 
     def _played(self, plays: Sequence[Play]) -> list[Rollout | DivergenceError]:
@@ -180,7 +186,9 @@ class TransitionRollouts:
             acting = self._acting(
                 [
                     Teams(
-                        t.encoder, jnp.repeat(jnp.stack(list(t.heads.values())), len(of[turn]), 0)
+                        t.encoder,
+                        jnp.repeat(jnp.stack(list(t.heads.values())), len(of[turn]), 0),
+                        scaling=t.scaling,
                     )
                     for t, of in zip(trials, pieces, strict=True)
                 ]
@@ -251,6 +259,13 @@ def _joined(parts: list[Score]) -> Score:
         np.concatenate([part.returns for part in parts]),
         np.concatenate([part.lengths for part in parts]),
     )
+
+
+def seen_by(rollout: Rollout, config: Config) -> Observed | None:
+    """The states in which teams chose an action, where they are normalised."""
+    if not config.env.normalise:
+        return None
+    return Observed(None, running_of(rollout.transitions.state))
 
 
 def scaled(transitions: Transition, scale: float) -> Transition:

@@ -13,6 +13,7 @@ from race.algorithms.base import Teams
 from race.envs.checked import CheckedEnv
 from race.envs.contract import in_units
 from race.errors import ExportError
+from race.method.normalisation import Affine, Scaling
 from race.programs import joint_actions
 from race.rollouts.choosing import Memory, choose
 from race.teams.formats import Function, signature
@@ -46,14 +47,22 @@ def shown_to(team: Team) -> Moments:
     spec, rng = team.spec, np.random.default_rng(0)
     real, masks = _episode(team)
     size = (RANDOM, spec.n_agents, spec.obs_size)
-    obs = np.concatenate([rng.normal(size=size).astype(np.float32), real])
-    encoder, heads = (part[team.name] for part in (team.trained.encoders, team.trained.heads))
-    teams = Teams(encoder, heads[None])
+    random = rng.normal(size=size).astype(np.float32)
+    if "obs.mean" in team.portable.arrays:  # spread as what was seen, and so is not all clipped
+        mean, factor = (team.portable.arrays[name] for name in ("obs.mean", "obs.factor"))
+        random = random / np.where(factor > 0, factor, np.float32(1)) + mean
+    obs = np.concatenate([random, real])
+    teams = team.trained.acting(team.name)
+    encoder, heads = teams.encoder, teams.heads[0]
     if isinstance(spec, EnvSpec):
         # Observations as they were, laid out as a state that shows each agent its own.
         apart, states = _apart(spec, obs)
         base = str(team.trained.config.base)
-        alike = Teams(encoder, jnp.broadcast_to(heads[None], (len(obs), *heads.shape)))
+        alike = Teams(
+            encoder,
+            jnp.broadcast_to(heads[None], (len(obs), *heads.shape)),
+            scaling=_of_apart(spec, teams.scaling),
+        )
         chosen = np.asarray(_joint(alike, states, spec=apart, base=base))
         low, high = (np.array(b, np.float32) for b in (spec.action_low, spec.action_high))
         return Moments({"obs": obs}, in_units(chosen, low, high), None, len(real))
@@ -102,6 +111,12 @@ def _apart(spec: EnvSpec, obs: NDArray[np.float32]) -> tuple[EnvSpec, NDArray[np
         episode_limit=spec.episode_limit,
     )
     return apart, obs.reshape(len(obs), -1)
+
+
+def _of_apart(spec: EnvSpec, scaling: Scaling | None) -> Scaling | None:
+    if scaling is None:
+        return None
+    return Scaling(None, Affine(*(part[spec.obs_gather].reshape(-1) for part in scaling.state)))
 
 
 def _episode(team: Team) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:

@@ -113,7 +113,8 @@ def evaluate(
     ):
         for start in range(0, episodes, BATCH):
             batch = seeds[start : start + BATCH]
-            trial = Trial(trained.encoders[name], {name: trained.heads[name]}, batch)
+            heads = {name: trained.heads[name]}
+            trial = Trial(trained.encoders[name], heads, batch, trained.scaling)
             parts.append(rollouts.test([trial])[0][name])
             advance(len(batch))
     wins = [part.won for part in parts if part.won is not None]

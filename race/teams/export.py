@@ -115,6 +115,7 @@ def _card(
         "agent": agent,
         "agents": spec.n_agents,
         "layer_norm": part.layer_norm,
+        "obs": f"as the environment shows it{_normalised(part)}",
         "inputs": {n: {"shape": ["batch", *s], "dtype": d} for n, (s, d) in inputs.items()},
         "outputs": {n: {"shape": ["batch", *s], "dtype": d} for n, (s, d) in outputs.items()},
     }
@@ -150,6 +151,10 @@ def _card(
         },
         "versions": {"race": __version__, "algorithm": str(ALGORITHM_VERSION), **made_with(kind)},
     }
+
+
+def _normalised(part: Portable) -> str:
+    return "; normalised inside" if "obs.mean" in part.arrays else ""
 
 
 def _tested(team: Team) -> dict[str, Any] | None:

@@ -5,8 +5,9 @@ from typing import Any, NamedTuple
 
 from race.algorithms.inheriting import Inherited
 from race.config.settings import Config
+from race.method.normalisation import Observed
 from race.teams.trained import load_trained
-from race.training.inheriting import made_to_fit, store
+from race.training.inheriting import made_to_fit, observed_to_fit, store
 from race.types import AnyTask
 
 
@@ -15,6 +16,7 @@ class InitialTeams(NamedTuple):
 
     teams: Inherited | None
     told: dict[str, Any]
+    observed: Observed | None = None
 
     def keep_in(self, path: Path) -> None:
         """Keeps them in a run directory that has just been made.
@@ -23,7 +25,7 @@ class InitialTeams(NamedTuple):
             CheckpointError: if they cannot be written.
         """
         if self.teams is not None:
-            store(path, self.teams, self.told)
+            store(path, self.teams, self.told, self.observed)
 
 
 def initial_teams(config: Config, task: AnyTask) -> InitialTeams:
@@ -45,4 +47,5 @@ def initial_teams(config: Config, task: AnyTask) -> InitialTeams:
         "from_task": source.config.task,
         "from_env_steps": source.progress.env_steps,
     }
-    return InitialTeams(teams, told)
+    observed = observed_to_fit(source.observed, source.path, task.spec)
+    return InitialTeams(teams, told, observed)

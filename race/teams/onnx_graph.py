@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.errors import ConfigError
+from race.method.normalisation import CLIP
 from race.networks.dense import VARIANCE_FLOOR
 from race.teams.portable import UNAVAILABLE, Portable
 from race.types import EnvSpec
@@ -51,10 +52,10 @@ class _Graph:
         """Nodes, inputs and outputs."""
         spec = self._team.spec
         if isinstance(spec, EnvSpec):
-            obs = self._input("obs", (spec.n_agents, spec.obs_size))
+            obs = self._shown(self._input("obs", (spec.n_agents, spec.obs_size)))
             self._joint_action(self._node("Transpose", obs, perm=[1, 0, 2]))
         else:
-            obs = self._input("obs", (spec.n_agents, spec.obs_size))
+            obs = self._shown(self._input("obs", (spec.n_agents, spec.obs_size)))
             memory = self._input("memory", (spec.n_agents, self._team.memory_size))
             available = self._input("avail_actions", (spec.n_agents, spec.n_actions), "BOOL")
             obs, memory = (self._node("Transpose", x, perm=[1, 0, 2]) for x in (obs, memory))
@@ -173,6 +174,19 @@ class _Graph:
         """Entries of the last axis."""
         ends = (self._constant(f"at_{place}", np.array([place])) for place in (start, stop))
         return self._node("Slice", x, *ends, self._constant("last_axis", np.array([2])))
+
+    def _shown(self, obs: str) -> str:
+        """As `race.teams.portable` has it."""
+        if "obs.mean" not in self._team.arrays:
+            return obs
+        names = ("obs.mean", "obs.factor")
+        mean, factor = (self._constant(name, self._team.arrays[name][None]) for name in names)
+        apart = self._node("Mul", self._node("Sub", obs, mean), factor)
+        low, high = (
+            self._constant(f"clip_{name}", np.array(bound, np.float32))
+            for name, bound in (("low", -CLIP), ("high", CLIP))
+        )
+        return self._node("Clip", apart, low, high)
 
     def _normalised(self, x: str) -> str:
         if not self._team.layer_norm:

@@ -30,6 +30,10 @@ discrete            shape                  is
 ``head.weight``       [N, H, A]            the heads W: scores of actions
 ``head.bias``         [N, A]
 ==================  =====================  ========================================================
+
+Where a run normalises what is observed, there are two more, ``obs.mean`` and ``obs.factor`` [N, O]:
+observations go in as the environment shows them, and ``(obs - mean) * factor`` within +-10 is what
+the networks see.
 """
 
 from collections.abc import Mapping
@@ -38,6 +42,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from race.method.normalisation import CLIP, Scaling
 from race.networks.dense import VARIANCE_FLOOR, Encoder
 from race.networks.recurrent import GruEncoder
 from race.types import DiscreteSpec, EnvSpec, Spec
@@ -65,13 +70,14 @@ class Portable(NamedTuple):
         return int(self.arrays["head.weight"].shape[1]) + self.spec.n_actions
 
 
-def portable(encoder: Any, heads: Any, spec: Spec) -> Portable:
+def portable(encoder: Any, heads: Any, spec: Spec, scaling: Scaling | None = None) -> Portable:
     """The portable form of a team.
 
     Args:
         encoder: of all agents: shared, or a network for each.
         heads: the policy representations [N, H + 1, A].
         spec: the task's.
+        scaling: of what environments show; None: as it is.
     """
     if isinstance(spec, EnvSpec):
         assert isinstance(encoder, Encoder)
@@ -85,8 +91,20 @@ def portable(encoder: Any, heads: Any, spec: Spec) -> Portable:
         arrays["joint"] = spec.joint_gather.astype(np.int64)
         arrays["low"] = np.array(spec.action_low, np.float32)
         arrays["high"] = np.array(spec.action_high, np.float32)
+    if scaling is not None:
+        arrays |= _scaling(scaling, spec)
     arrays = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     return Portable(spec, bool(encoder.layer_norm), arrays)
+
+
+def _scaling(scaling: Scaling, spec: Spec) -> dict[str, NDArray[Any]]:
+    if isinstance(spec, EnvSpec):
+        seen, mask = spec.obs_gather, spec.obs_mask.astype(np.float32)
+        mean, factor = (np.asarray(part)[seen] * mask for part in scaling.state)
+    else:
+        assert scaling.obs is not None
+        mean, factor = (np.asarray(part) for part in scaling.obs)
+    return {"obs.mean": mean, "obs.factor": factor}
 
 
 def _continuous(encoder: Encoder, spec: EnvSpec) -> dict[str, NDArray[Any]]:
@@ -152,6 +170,9 @@ def of_agent(team: Portable, agent: int) -> Portable:
             episode_limit=spec.episode_limit,
         )
         arrays["hidden.weight"] = arrays["hidden.weight"][:, :seen]
+        for name in ("obs.mean", "obs.factor"):
+            if name in arrays:
+                arrays[name] = arrays[name][:, :seen]
         for name in ("head.weight", "head.bias"):
             arrays[name] = arrays[name][..., :moved]
         arrays["joint"] = np.arange(moved)
@@ -172,7 +193,7 @@ def joint_action(xp: Any, arrays: Arrays, layer_norm: bool, obs: Any) -> Any:
     Returns:
         [B, U].
     """
-    x = xp.moveaxis(obs, 1, 0)  # [N, B, O]
+    x = xp.moveaxis(_shown(xp, obs, arrays), 1, 0)  # [N, B, O]
     for layer in ("hidden", "out"):
         x = _layer(xp, x, arrays[f"{layer}.weight"], arrays[f"{layer}.bias"])
         x = xp.tanh(_normalised(xp, x) if layer_norm else x)
@@ -203,7 +224,7 @@ def next_actions(
         Actions [B, N], of int32, and the next memory.
     """
     size = arrays["head.weight"].shape[1]
-    obs, memory = xp.moveaxis(obs, 1, 0), xp.moveaxis(memory, 1, 0)
+    obs, memory = xp.moveaxis(_shown(xp, obs, arrays), 1, 0), xp.moveaxis(memory, 1, 0)
     carry, last = memory[..., :size], memory[..., size:]
     x = xp.matmul(last, arrays["action.weight"])
     x = x + _layer(xp, obs, arrays["obs.weight"], arrays["obs.bias"])
@@ -221,6 +242,14 @@ def next_actions(
     chosen = xp.arange(scores.shape[-1])[None, None] == action[..., None]
     memory = xp.concatenate([xp.moveaxis(carry, 0, 1), chosen.astype(np.float32)], axis=-1)
     return action.astype(np.int32), memory
+
+
+def _shown(xp: Any, obs: Any, arrays: Arrays) -> Any:
+    """As `race.method.normalisation.scaled`, where the team has it."""
+    if "obs.mean" not in arrays:
+        return obs
+    apart = (obs - arrays["obs.mean"][None]) * arrays["obs.factor"][None]
+    return xp.clip(apart, np.float32(-CLIP), np.float32(CLIP))
 
 
 def _layer(xp: Any, x: Any, weight: Any, bias: Any) -> Any:

@@ -27,7 +27,8 @@ class Team:
 
     def __init__(self, trained: Trained, name: str) -> None:
         self.trained, self.name = trained, name
-        self.portable = portable(trained.encoders[name], trained.heads[name], trained.task.spec)
+        spec, scaling = trained.task.spec, trained.scaling
+        self.portable = portable(trained.encoders[name], trained.heads[name], spec, scaling)
         self._arrays = self.portable.arrays
         self._memory: NDArray[np.float32] | None = None
 

@@ -17,6 +17,7 @@ from race.config.settings import Config, TeamName
 from race.envs import contract, make_task
 from race.envs.description import refuse_changed
 from race.errors import ConfigError, HandedOverError, RunDirectoryError, command
+from race.method.normalisation import Observed, Scaling, scaling_of
 from race.programs import act
 from race.rollouts.choosing import blank, choose
 from race.runs import checkpoints, team_files
@@ -25,7 +26,7 @@ from race.runs.checkpoints import Checkpoint
 from race.runs.directory import RunDirectory
 from race.training.keeping import kept_teams
 from race.training.run_state import Progress
-from race.training.saving import check_owner, looked_at, one_of, progress_of
+from race.training.saving import check_owner, looked_at, observed_of, one_of, progress_of
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, Observation, Task
 
 _choose = jax.jit(choose)
@@ -45,6 +46,17 @@ class Trained(NamedTuple):
     heads: dict[str, Float[Array, "N H1 A"]]  # "marl" and "champion", as far as there are such
     kept: str | None = None
     """The name of the one team of the best that this is; None of a checkpoint."""
+    observed: Observed | None = None
+    """What the run's teams had seen by then, where observations are normalised."""
+
+    @property
+    def scaling(self) -> Scaling | None:
+        """How the teams' networks are shown what environments show; None: as it is."""
+        return None if self.observed is None else scaling_of(self.observed)
+
+    def acting(self, name: str) -> Teams:
+        """A team, ``marl`` or ``champion``, as programs take it."""
+        return Teams(self.encoders[name], self.heads[name][None], scaling=self.scaling)
 
     def resolve(self, team: str) -> str:
         """``marl`` or ``champion``: what ``selected`` stands for by the training returns.
@@ -88,7 +100,7 @@ class Trained(NamedTuple):
                 "played by recurrent_policy."
             )
         name = self.resolve(team)
-        teams = Teams(self.encoders[name], self.heads[name][None])
+        teams = self.acting(name)
         spec, base = self.task.spec, str(self.config.base)
 
         def joint_action(state: ArrayLike) -> NDArray[np.float32]:
@@ -107,7 +119,7 @@ class Trained(NamedTuple):
         if not isinstance(self.task, DiscreteTask):
             raise ConfigError(f"{self.config.task} has continuous actions: call policy instead.")
         name = self.resolve(team)
-        return RecurrentPolicy(Teams(self.encoders[name], self.heads[name][None]), self.task.spec)
+        return RecurrentPolicy(self.acting(name), self.task.spec)
 
 
 @final
@@ -177,15 +189,16 @@ def load_trained(path: str | os.PathLike[str], checkpoint: str | None = None) ->
     check_owner(saved, identity)
     task, algorithm = make_task(config.task, config.env), algorithm_of(config)
     refuse_changed(run_directory.recorded_task(path), task)
-    progress = progress_of(saved)
+    progress, observed = progress_of(saved), observed_of(saved, config, task.spec)
     if place.is_file():
         name, kept = str(saved.info["team"]), place.name.removesuffix(team_files.SUFFIX)
         encoder, head = one_of(saved, name, config, task.spec, algorithm)
-        return Trained(path, identity, config, task, progress, {name: encoder}, {name: head}, kept)
+        teams = ({name: encoder}, {name: head})
+        return Trained(path, identity, config, task, progress, *teams, kept, observed)
     groups = algorithm.tested(looked_at(saved, config, task.spec, algorithm), task.spec)
     encoders = {name: group.encoder for group in groups for name in group.heads}
     heads = {name: head for group in groups for name, head in group.heads.items()}
-    return Trained(path, identity, config, task, progress, encoders, heads)
+    return Trained(path, identity, config, task, progress, encoders, heads, None, observed)
 
 
 def names_of_checkpoints(path: Path) -> list[str]:

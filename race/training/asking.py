@@ -10,7 +10,7 @@ from race.config.effects import refuse_without_effect, setting, usual, without_e
 from race.config.files import Wanted, with_settings
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config
-from race.envs import pettingzoo, reads_config, reads_game, reads_team, starcraft
+from race.envs import jaxmarl, pettingzoo, reads_config, reads_game, reads_team, starcraft
 from race.envs.own import is_own
 from race.envs.trial import try_out
 from race.errors import ConfigError, say
@@ -98,7 +98,8 @@ def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
 
 def is_tried(task_id: str) -> bool:
     """Whether an environment of that name is looked at before it is trained on; others repeat."""
-    return is_own(task_id) or task_id.startswith(pettingzoo.PREFIX) or starcraft.is_game(task_id)
+    others = (pettingzoo.PREFIX, jaxmarl.PREFIX)
+    return is_own(task_id) or task_id.startswith(others) or starcraft.is_game(task_id)
 
 
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
@@ -120,6 +121,8 @@ def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
     found: dict[str, Any] = {"repeats": trial.repeats, "conflict": trial.conflict}
     if task_id.startswith(pettingzoo.PREFIX):
         found["packages"] = pettingzoo.packages(task_id.removeprefix(pettingzoo.PREFIX))
+    if task_id.startswith(jaxmarl.PREFIX):
+        found["packages"] = jaxmarl.packages()
     return found
 
 

@@ -4,6 +4,7 @@ Everything that changes of a run is one `RunState`; each function maps it to the
 long is done for several runs at once: `race.training.cohort` decides for which.
 """
 
+import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -14,6 +15,7 @@ from race import programs
 from race.algorithms.base import Tested
 from race.config.settings import Config
 from race.errors import CheckpointError, DivergenceError, RunDirectoryError
+from race.method.normalisation import Observed, observed_more
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.training.keeping import keep_best
@@ -38,10 +40,11 @@ def warm_up(run: Run, state: RunState) -> RunState:
     warm = run.rollouts.warm_up(run.config, state.replay, report, lambda: run.interrupts.requested)
     if warm is None:
         return state
-    replay, steps = warm
+    steps = warm.env_steps
     repeated = state.progress.repeated + run.rollouts.repeated - before
     progress = state.progress.but(env_steps=steps, random_steps=steps, repeated=repeated)
-    return state._replace(replay=replay, progress=progress)
+    state = state._replace(replay=warm.replay, progress=progress)
+    return _observed(state, warm.observed)
 
 
 def to_play(run: Run, state: RunState) -> Play:
@@ -54,6 +57,7 @@ def to_play(run: Run, state: RunState) -> Play:
         teams = teams.at(slice(teams.count - 1, None))  # of a population nobody plays yet
     if n_marl:
         teams = teams.last_again(n_marl)
+    teams = dataclasses.replace(teams, scaling=state.scaling)
     return Play(config, teams, n_marl, progress.generation, progress.env_steps, state.replay)
 
 
@@ -73,7 +77,18 @@ def noted(state: RunState, played: Generation, n_marl: int) -> RunState:
         learning=True,
         repeated=progress.repeated + played.repeated,
     )
-    return state._replace(progress=progress)
+    return _observed(state._replace(progress=progress), played.observed)
+
+
+def _observed(state: RunState, now: Observed | None) -> RunState:
+    """The state with what its teams have just seen.
+
+    Statistics change here alone, so that all teams of a generation are shown things alike, and its
+    gradient steps all see the buffer alike. Tests do not count.
+    """
+    if state.observed is None or now is None:
+        return state
+    return state._replace(observed=observed_more(state.observed, now))
 
 
 def evolve(run: Run, state: RunState) -> RunState:
@@ -159,7 +174,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[Outcome]:
         seeds = host_seeds(run.config.seed, Purpose.EVALUATION, state.progress.generation, episodes)
         tested = run.algorithm.tested(state.algorithm, run.task.spec)
         teams.append(tested)
-        groups.append([Trial(encoder, heads, seeds) for encoder, heads in tested])
+        groups.append([Trial(encoder, heads, seeds, state.scaling) for encoder, heads in tested])
     rollouts = runs[0].rollouts
     before = rollouts.repeated
     scores = [
@@ -178,7 +193,7 @@ def test(runs: Sequence[Run], states: Sequence[RunState]) -> list[Outcome]:
         row = evaluation_row(progress, found)
         try:
             run.metrics.write(row)
-            keep_best(run, tested, found, progress)
+            keep_best(run, tested, found, progress, state.observed)
         except (RunDirectoryError, CheckpointError) as error:
             after.append(error)
             continue

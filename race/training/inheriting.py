@@ -19,13 +19,14 @@ from race.config.settings import Config
 from race.config.shape import shape_of
 from race.errors import ConfigError, RunDirectoryError, command
 from race.learners import learner_of
+from race.method.normalisation import Observed, nothing_observed
 from race.programs import start
 from race.randomness import Purpose, root_key
 from race.runs import directory as run_directory
 from race.runs import team_files
 from race.runs.directory import RunDirectory
 from race.runs.trees import blank, flatten, restore
-from race.training.run_state import statics
+from race.training.run_state import RunState, statics
 from race.types import Spec, Team
 
 
@@ -57,6 +58,8 @@ def made_to_fit(
     apart = origin.whole_teams  # then a champion has networks of its own
     if origin.discrete != config.discrete:
         raise _misfit(source, "the one has discrete actions and the other has not")
+    if origin.env.normalise != config.env.normalise:
+        raise _misfit(source, "one of the two normalises observations (--env.normalise)")
     encoder, head, team = encoders[marl], np.asarray(heads[marl]), None
     if config.has_marl and template.head is not None and len(template.head) < len(head):
         if not (head == head[:1]).all():
@@ -76,23 +79,49 @@ def made_to_fit(
     return fitted
 
 
-def store(path: Path, inherited: Inherited, told: Mapping[str, Any]) -> None:
+def observed_to_fit(observed: Observed | None, source: Path, spec: Spec) -> Observed | None:
+    """What the other run's teams have seen, where observations are normalised.
+
+    Networks go on seeing things as they did; what the new run sees is added.
+
+    Raises:
+        ConfigError: if its task shows things of other sizes.
+    """
+    if observed is not None:
+        there, here = flatten(observed), flatten(nothing_observed(spec))
+        for name in there:
+            if there[name].shape != here[name].shape:
+                shapes = [list(side[name].shape) for side in (there, here)]
+                raise _misfit(source, f"{name[1:]} is {shapes[0]} there and {shapes[1]} here")
+    return observed
+
+
+def store(
+    path: Path, inherited: Inherited, told: Mapping[str, Any], observed: Observed | None = None
+) -> None:
     """Keeps what a run begins with in its directory, which is there.
 
     Args:
         path: the run directory.
         inherited: what it begins with.
         told: where that comes from.
+        observed: what the teams have seen, where observations are normalised.
 
     Raises:
         CheckpointError: if it cannot be written.
     """
     info = {**told, "run": run_directory.identity_of(path)}
-    team_files.write(RunDirectory(path).init, flatten(inherited), info)
+    arrays = flatten(inherited)
+    if observed is not None:
+        arrays |= flatten({_OBSERVED: observed})
+    team_files.write(RunDirectory(path).init, arrays, info)
 
 
-def inherit(path: Path, fresh: Any, config: Config, spec: Spec) -> Any:
-    """The fresh state of a run's algorithm, with what its directory says that it begins with.
+_OBSERVED = "observed"
+
+
+def inherit(path: Path, fresh: RunState, config: Config, spec: Spec) -> RunState:
+    """The fresh state of a run, with what its directory says that it begins with.
 
     Raises:
         CheckpointError: if that is damaged.
@@ -104,8 +133,14 @@ def inherit(path: Path, fresh: Any, config: Config, spec: Spec) -> Any:
             f"{RunDirectory(path).init} belongs to another run than config.json beside it. Put "
             "each back where it was."
         )
+    observed = None
+    if config.env.normalise:
+        template = {_OBSERVED: nothing_observed(spec)}
+        held = {name: arrays.pop(name) for name in flatten(template) if name in arrays}
+        observed = restore(template, held)[_OBSERVED]
     inherited = restore(_template(config, spec), arrays)
-    return begun_with(fresh, jax.tree.map(jnp.asarray, inherited))
+    begun = begun_with(fresh.algorithm, jax.tree.map(jnp.asarray, inherited))
+    return fresh._replace(algorithm=begun, observed=observed)
 
 
 def _template(config: Config, spec: Spec) -> Inherited:

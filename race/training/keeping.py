@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from race import ALGORITHM_VERSION
 from race.algorithms.base import Tested
 from race.errors import CheckpointError
+from race.method.normalisation import Observed
 from race.rollouts.base import Score
 from race.runs import team_files
 from race.runs.directory import RunDirectory
@@ -50,7 +51,11 @@ def kept_teams(run_dir: Path) -> list[Kept]:
 
 
 def keep_best(
-    run: Run, tested: Sequence[Tested], scores: Mapping[str, Score], progress: Progress
+    run: Run,
+    tested: Sequence[Tested],
+    scores: Mapping[str, Score],
+    progress: Progress,
+    observed: Observed | None = None,
 ) -> None:
     """Keeps those of some teams that are among the best, and forgets those that no longer are.
 
@@ -62,6 +67,7 @@ def keep_best(
         tested: the teams.
         scores: their results, by name.
         progress: how far the run is.
+        observed: what its teams have seen, where observations are normalised.
 
     Raises:
         CheckpointError: if a file cannot be written.
@@ -89,6 +95,9 @@ def keep_best(
                 "return_std": score.std,
                 "win_rate": score.win_rate,
             }
-            team_files.write(path, flatten({"encoder": encoder, "head": head}), info)
+            held: dict[str, Any] = {"encoder": encoder, "head": head}
+            if observed is not None:
+                held["observed"] = observed
+            team_files.write(path, flatten(held), info)
     for kept in kept_teams(run.directory.path)[count:]:
         kept.path.unlink(missing_ok=True)

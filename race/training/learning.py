@@ -45,6 +45,7 @@ def learn(run: Run, state: RunState) -> RunState | DivergenceError:
         hyper=state.hyper,
         **run.statics,
         layouts=laid,
+        scaling=state.scaling,
     )
     return _after(run, state, algorithm, losses, count)
 
@@ -66,7 +67,7 @@ def learn_together(
             laid.append(layout)
         rows = max(layout.time.shape[2] for layout in laid)
         batches = [
-            cohort.minibatches_of(state.replay, widened(layout, rows))
+            cohort.minibatches_of(state.replay, widened(layout, rows), state.scaling)
             for state, layout in zip(states, laid, strict=True)
         ]
     else:
@@ -76,7 +77,12 @@ def learn_together(
         ]
         batches = [
             cohort.minibatches(
-                state.replay, key, first, room=_chunk(run), shape=run.statics["shape"]
+                state.replay,
+                key,
+                first,
+                room=_chunk(run),
+                shape=run.statics["shape"],
+                scaling=state.scaling,
             )
             for run, state, key, first in zip(runs, states, keys, firsts, strict=True)
         ]

@@ -94,8 +94,7 @@ def begin(
             check_version(origin.get("algorithm_version", 1) if origin else None)
             state = fresh(config, task.spec, algorithm, rollouts.empty_replay(config))
             if config.init_from is not None:
-                begun = inherit(path, state.algorithm, config, task.spec)
-                state = state._replace(algorithm=begun)
+                state = inherit(path, state, config, task.spec)
         else:
             # An empty buffer beside the full one would take as much memory again.
             shapes = jax.eval_shape(lambda: rollouts.empty_replay(config))

@@ -10,6 +10,7 @@ from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config
 from race.config.shape import shape_of
 from race.errors import CheckpointError, DivergenceError, RunDirectoryError
+from race.method.normalisation import Observed, Scaling, nothing_observed, scaling_of
 from race.networks.optimization import copy
 from race.programs import empty_losses, start
 from race.randomness import Purpose, root_key
@@ -100,6 +101,12 @@ class RunState(NamedTuple):
     replay: Replay
     progress: Progress
     hyper: Hyper
+    observed: Observed | None = None  # where observations are normalised
+
+    @property
+    def scaling(self) -> Scaling | None:
+        """How networks are shown what environments show; None: as it is."""
+        return None if self.observed is None else scaling_of(self.observed)
 
 
 Outcome = RunState | DivergenceError | RunDirectoryError | CheckpointError
@@ -120,4 +127,5 @@ def fresh(config: Config, spec: Spec, algorithm: Algorithm, replay: Replay) -> R
         replay=replay,
         progress=Progress(),
         hyper=hyper_of(config),
+        observed=nothing_observed(spec) if config.env.normalise else None,
     )

@@ -13,6 +13,7 @@ from race.algorithms import Algorithm
 from race.config.hyper import hyper_of
 from race.config.settings import Config
 from race.errors import CheckpointError, DivergenceError
+from race.method.normalisation import Observed, nothing_observed
 from race.networks.optimization import copy
 from race.programs import empty_losses, start
 from race.randomness import Purpose, root_key
@@ -60,7 +61,10 @@ def _contents(
     replay = state.replay
     columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
     rows = Rows(columns, int(replay.inserted), replay.capacity)
-    arrays = flatten({"algorithm": state.algorithm, "losses": state.losses})
+    held = {"algorithm": state.algorithm, "losses": state.losses}
+    if state.observed is not None:
+        held[_OBSERVED] = state.observed
+    arrays = flatten(held)
     info = {
         "progress": dataclasses.asdict(progress),
         "algorithm_version": ALGORITHM_VERSION,
@@ -126,8 +130,38 @@ def from_checkpoint(
     check_version(saved.info.get("algorithm_version", 1))
     progress = progress_of(saved)
     trained = learned_of(saved, config, spec, algorithm)
-    filled = _filled(saved, replay)
-    return RunState(trained["algorithm"], trained["losses"], filled, progress, hyper_of(config))
+    filled, observed = _filled(saved, replay), observed_of(saved, config, spec)
+    hyper = hyper_of(config)
+    return RunState(trained["algorithm"], trained["losses"], filled, progress, hyper, observed)
+
+
+def observed_of(saved: Checkpoint, config: Config, spec: Spec) -> Observed | None:
+    """What the run's teams had seen by then, where observations are normalised.
+
+    Raises:
+        CheckpointError: if the checkpoint does not hold it.
+    """
+    if not config.env.normalise:
+        return None
+    found: Observed = restore({_OBSERVED: nothing_observed(spec)}, _parts(saved.arrays)[1])[
+        _OBSERVED
+    ]
+    return found
+
+
+_OBSERVED = "observed"
+
+
+def _parts(arrays: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The arrays of programs, and those that stay on the host in 64 bits."""
+    mine = {name for name in arrays if name.startswith(f"['{_OBSERVED}']")}
+    kept = {name: value for name, value in arrays.items() if name not in mine}
+    return kept, {name: arrays[name] for name in mine}
+
+
+def _of_programs(saved: Checkpoint, config: Config) -> dict[str, Any]:
+    # Without the setting nothing reads statistics, and restoring refuses what nothing reads.
+    return _parts(saved.arrays)[0] if config.env.normalise else saved.arrays
 
 
 def learned_of(
@@ -140,7 +174,7 @@ def learned_of(
     """
     template = _fresh(config, spec, algorithm)
     # Restored arrays may live in the file's memory; the programs of a run reuse what they get.
-    return copy(restore(template, _as_now(saved.arrays, template)))
+    return copy(restore(template, _as_now(_of_programs(saved, config), template)))
 
 
 def looked_at(saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorithm) -> Any:
@@ -152,7 +186,8 @@ def looked_at(saved: Checkpoint, config: Config, spec: Spec, algorithm: Algorith
         CheckpointError: if it was written by a run with other networks or another task.
     """
     template = blank(jax.eval_shape(lambda: _fresh(config, spec, algorithm)))
-    return _on_device(restore(template, _as_now(saved.arrays, template))["algorithm"])
+    arrays = _as_now(_of_programs(saved, config), template)
+    return _on_device(restore(template, arrays)["algorithm"])
 
 
 def one_of(
@@ -169,7 +204,8 @@ def one_of(
         (found,) = ((group.encoder, group.heads[name]) for group in groups if name in group.heads)
         return {"encoder": found[0], "head": found[1]}
 
-    restored = _on_device(restore(blank(jax.eval_shape(tested)), saved.arrays))
+    template = blank(jax.eval_shape(tested))
+    restored = _on_device(restore(template, _of_programs(saved, config)))
     return restored["encoder"], restored["head"]
 
 

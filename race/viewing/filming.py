@@ -111,7 +111,9 @@ def _battle(trained: Trained, team: str, seed: int, seconds: float, small: bool)
     assert isinstance(trained.task, DiscreteTask)
     name = trained.resolve(team)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
-        actions = rollouts.episode(trained.encoders[name], trained.heads[name], seed)
+        actions = rollouts.episode(
+            trained.encoders[name], trained.heads[name], seed, trained.scaling
+        )
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     played = make(trained.config.task.removeprefix("micro/"))

@@ -19,13 +19,14 @@ from race.envs import make_discrete_task
 from race.errors import DivergenceError, TaskError
 from race.learners.facmac import logits, new_encoder
 from race.method.exploration import greedy
+from race.method.normalisation import Observed, Running, scaling_of
 from race.networks.recurrent import embed_episodes
 from race.replay.buffer import Replay
 from race.rollouts import device, discrete
 from race.rollouts.base import Generation, Play, Trial
 from race.rollouts.choosing import Exploration
 from race.rollouts.discrete import EpisodeRollouts
-from race.rollouts.episodes import Part, Played, empty_episode
+from race.rollouts.episodes import Part, Played, empty_episode, seen_in
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
 from race.types import DeviceEnv, DiscreteSpec, DiscreteTask, Observation, Outcome
@@ -461,6 +462,31 @@ def test_rewards_are_scaled_and_returns_are_not(on_device: bool) -> None:
     assert np.abs(whole.data.reward).max() > 0
     np.testing.assert_array_equal(part.data.reward, np.float32(0.25) * whole.data.reward)
     assert_same(part.data._replace(reward=0), whole.data._replace(reward=0))
+
+
+def test_teams_that_normalise_play_alike_on_host_and_device() -> None:
+    task = task_of("countdown")
+    spec, raw = task.spec, teams_of(task.spec, 3)
+    rng = np.random.default_rng(2)
+
+    def seen(*shape: int) -> Running:
+        mean = 10 * rng.normal(size=shape)
+        return Running(np.asarray(9.0), mean, 9 * rng.uniform(1, 100, shape))
+
+    known = Observed(seen(spec.n_agents, spec.obs_size), seen(spec.state_size))
+    teams = dataclasses.replace(raw, scaling=scaling_of(known))
+    here, there = (play(task, teams, SEEDS[0][:3], None, on_device=on) for on in (False, True))
+    assert_same(here.episodes, there.episodes)
+    plain = play(task, raw, SEEDS[0][:3], None, on_device=True)
+    assert (plain.episodes.action != there.episodes.action).any()
+    episodes, found = there.episodes, seen_in(there.episodes)
+    acted = [(t, i) for t in range(3) for i in range(int(episodes.length[t]))]
+    assert found.obs is not None
+    for running, column in ((found.obs, episodes.obs), (found.state, episodes.state)):
+        rows = np.stack([column[place] for place in acted]).astype(np.float64)
+        assert running.number == len(rows)
+        np.testing.assert_allclose(running.mean, rows.mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(running.squares / len(rows), rows.var(axis=0), atol=1e-12)
 
 
 @pytest.mark.parametrize(("name", "on_device"), [("probe/memory", True), ("probe/lives", False)])

@@ -2,14 +2,13 @@
 
 import contextlib
 import time
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Float
 
 from race.envs.checked import CheckedEnv
-from race.envs.pettingzoo.environment import TeamEnv
 from race.errors import EnvFailedError
 
 _STEPS: Final = 2000
@@ -33,6 +32,23 @@ class Conflict(NamedTuple):
     correlation: float
 
 
+@runtime_checkable
+class Paying(Protocol):
+    """An environment that tells what each agent of its team was paid."""
+
+    action_space: Any
+
+    @property
+    def team(self) -> Any:
+        """Names of the team's agents."""
+        ...
+
+    @property
+    def paid(self) -> Any:
+        """What each of them was paid in the newest step."""
+        ...
+
+
 def look(env: CheckedEnv) -> Conflict | None:
     """Plays at random and compares what the agents of a team are paid.
 
@@ -46,13 +62,13 @@ def look(env: CheckedEnv) -> Conflict | None:
         HandedOverError: if what it shows breaks the contract.
     """
     team = env.env
-    if not isinstance(team, TeamEnv) or len(team.parallel.team) < 2:
+    if not isinstance(team, Paying) or len(team.team) < 2:
         return None
     found = opposed(_rewards(env, team))
     if found is None:
         return None
     one, other, correlation = found
-    return Conflict(str(team.parallel.team[one]), str(team.parallel.team[other]), correlation)
+    return Conflict(str(team.team[one]), str(team.team[other]), correlation)
 
 
 def opposed(rewards: Float[np.ndarray, "steps N"]) -> tuple[int, int, float] | None:
@@ -73,7 +89,7 @@ def opposed(rewards: Float[np.ndarray, "steps N"]) -> tuple[int, int, float] | N
     return first, second, lowest
 
 
-def _rewards(env: CheckedEnv, team: TeamEnv) -> Float[np.ndarray, "steps N"]:
+def _rewards(env: CheckedEnv, team: Paying) -> Float[np.ndarray, "steps N"]:
     random = np.random.default_rng(0)
     found: list[list[float]] = []
     began, episode, over = time.monotonic(), 0, True
@@ -90,5 +106,5 @@ def _rewards(env: CheckedEnv, team: TeamEnv) -> Float[np.ndarray, "steps N"]:
                 rows = seen.avail_actions
                 step = env.step(np.array([random.choice(np.flatnonzero(row)) for row in rows]))
             seen, over = step.seen, step.terminated or step.truncated
-            found.append(list(team.parallel.rewards))
-    return np.array(found).reshape(len(found), len(team.parallel.team))
+            found.append(list(team.paid))
+    return np.array(found).reshape(len(found), len(team.team))

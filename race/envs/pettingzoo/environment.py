@@ -104,6 +104,16 @@ class TeamEnv(gymnasium.Env[Any, Any]):
         )
 
     @property
+    def team(self) -> list[Any]:
+        """Names of the team's agents."""
+        return self.parallel.team
+
+    @property
+    def paid(self) -> list[float]:
+        """What each of them was paid in the newest step."""
+        return list(self.parallel.rewards)
+
+    @property
     def own_state_names(self) -> list[str] | None:
         """Names of the entries of the environment's own state; None if it is not in use."""
         return None if self._own_state is None else self._own_state.names()
