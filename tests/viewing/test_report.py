@@ -32,6 +32,7 @@ from race.viewing.scores import scores_of
 from race.viewing.tables import as_json
 
 pytest.importorskip("plotly")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome"))), None)
 KIND = {name: number for number, name in enumerate(evolution.KINDS)}
 
 
@@ -122,6 +123,16 @@ def test_the_page_asks_for_nothing_from_outside(page: str) -> None:
     assert re.findall(r'(?:src|href)="([^"]*)"', own) == ["data:,"]
     assert "<title>&lt;A&gt; &amp; B</title>" in page
     assert len(page) < 3.5e6
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium here; slow tests say more of pages in one")
+def test_a_browser_draws_the_page(page: str, tmp_path: Path) -> None:
+    (tmp_path / "page.html").write_text(page)
+    words = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'user'}"]
+    words += ["--virtual-time-budget=20000", "--dump-dom", (tmp_path / "page.html").as_uri()]
+    done = subprocess.run([str(CHROMIUM), *words], capture_output=True, text=True, timeout=120)
+    assert 'data-drawn="1"' in done.stdout
+    assert done.stdout.count('class="main-svg"') > 10
 
 
 def test_names_cannot_end_the_script() -> None:

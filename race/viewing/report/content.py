@@ -15,6 +15,7 @@ from race.viewing.comparison import compare
 from race.viewing.curves import Axis
 from race.viewing.plotting import colours_of
 from race.viewing.report import evolution
+from race.viewing.report.made import Made
 from race.viewing.scores import scores_of, tests_and_end
 from race.viewing.tables import LEGEND, as_json, estimate, remarks, seconds, tables_of
 
@@ -30,7 +31,13 @@ _BETTER = tuple(
 )
 
 
-def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | None) -> Any:
+def content_of(
+    runs: Sequence[Recorded],
+    metric: str,
+    team: str,
+    base: str | None,
+    made: Made | None = None,
+) -> Any:
     """Everything on the page.
 
     Args:
@@ -38,6 +45,7 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         metric: as `race.viewing.scores.scores_of`.
         team: whose tests the tables are about.
         base: as `race.viewing.comparison.compare`.
+        made: what was made of the runs' checkpoints.
 
     Raises:
         RaceError: if no run has a row yet, or two are the same.
@@ -46,6 +54,7 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         raise chosen.no_values(runs, "return_mean")
     chosen.refuse_twins(runs)
     names = chosen.names_of(runs)
+    made = made or Made({}, [])
     tables: list[dict[str, Any]] = []
     comparison, said = None, []
     try:
@@ -65,7 +74,11 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         "kinds": list(evolution.KINDS),
         "colours": colours_of(sorted(set(names))),
         "bands": _bands(runs, names),
-        "runs": [_run(run, name) for run, name in zip(runs, names, strict=True)],
+        "not_made": made.remarks,
+        "runs": [
+            _run(run, name) | made.of_runs.get(run.name, {})
+            for run, name in zip(runs, names, strict=True)
+        ],
     }
 
 
