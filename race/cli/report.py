@@ -81,6 +81,7 @@ def main(arguments: list[str]) -> None:
         maker = Maker(replays, chosen.videos, telling.tell)
 
         def make(watched: str = "") -> str:
+            gc.unfreeze()  # of the page before
             telling.tell("reading runs", 0, 1)
             with _no_collection():
                 runs = load(chosen.runs)
@@ -115,6 +116,7 @@ def _no_collection() -> Iterator[None]:
     try:
         yield
     finally:
+        gc.freeze()  # what is there now is not looked through later either
         gc.enable()
 
 

@@ -50,7 +50,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
 def shown(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page with battles and videos of two runs that were trained for a moment."""
     folder = tmp_path_factory.mktemp("shown")
-    tiny = "--env-steps 130 --evaluation.episodes 1 --facmac.batch-size 2 --race.population-size 3"
+    tiny = "--env-steps 130 --evaluation.episodes 1 --facmac.batch-size 2"
     for seed in ("1", "2"):
         words = ["train", "micro/3m", *tiny.split(), "--seed", seed]
         main([*words, "--run-dir", str(folder / seed)])
@@ -207,8 +207,8 @@ def test_videos_play_and_distances_are_drawn(browser: Any, shown: str) -> None:
         "[...document.querySelectorAll('#evolution .chart')].map(c => c.data[0])"
         ".filter(t => t.type === 'heatmap')"
     )
-    assert [name.split()[0] for name in heat["x"]] == ["team"] * 3 + ["MARL"]
-    assert [row[k] for k, row in enumerate(heat["z"])] == [0] * 4
+    assert [name.split()[0] for name in heat["x"]] == ["team"] * 5 + ["MARL"]
+    assert [row[k] for k, row in enumerate(heat["z"])] == [0] * 6
     window.page.locator("#seeds input[value='2']").click()
     assert window.page.locator("#videos video").count() == 1
     assert window.said == []
