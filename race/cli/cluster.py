@@ -144,7 +144,7 @@ class Cluster:
         traceback: TracebackType | None,
     ) -> None:
         for task in self._sent:
-            if task.poll() is None:
+            if not task.ended:
                 task.end()
         with contextlib.suppress(Exception):  # it may be gone
             self._ray.shutdown()
@@ -169,7 +169,8 @@ class _Task:
     ) -> None:
         self._ray, self._signs, self._number = ray, signs, next(_numbers)
         self._code: int | None = None
-        self._asked = False
+        self._asked = 0  # times
+        self._cancelled = False
         self._told = ""
         send = ray.remote(carry_out).options(
             num_cpus=need.cores,
@@ -190,7 +191,19 @@ class _Task:
                 ended, _ = self._ray.wait([self._answer], timeout=0)
             if ended:
                 self._code = self._ending()
+            elif self._asked > 1:
+                self.end()
+            elif self._asked and not self._cancelled:
+                self._cancelled = True
+                if not begun(self._signs, self._number).exists():
+                    with contextlib.suppress(Exception):  # it may have ended
+                        self._ray.cancel(self._answer)
         return self._code
+
+    @property
+    def ended(self) -> bool:
+        """Whether its end has been seen."""
+        return self._code is not None
 
     def _ending(self) -> int:
         errors = self._ray.exceptions
@@ -207,22 +220,19 @@ class _Task:
             return LOST
         except errors.RayTaskError as error:
             self._told = str(error.cause)
-            return 1
+        except errors.RayError as error:
+            self._told = " ".join(str(error).split())[:300]
+        return 1
 
     def interrupt(self) -> None:
-        """Asks it, and all others, to save and stop; one that has not begun does not begin.
+        """Asks it, and all others, to save and stop; asked again, it ends at once.
 
-        Asked again, it ends at once.
+        What is to be said to Ray is said at the next look: a signal's handler may come in between
+        anything that is being said to it.
         """
-        if self._asked:
-            self.end()
-            return
-        self._asked = True
+        self._asked += 1
         with contextlib.suppress(OSError):
             (self._signs / STOP).touch()
-        if not begun(self._signs, self._number).exists():
-            with contextlib.suppress(Exception):  # it may have ended
-                self._ray.cancel(self._answer)
 
     def end(self) -> None:
         """Ends it at once."""
@@ -281,7 +291,12 @@ def _join(ray: Any, grpc: Any, on: str) -> None:
     address = on.removeprefix("ray://")
     address = address if ":" in address else f"{address}:{PORT}"
     _await_answer(grpc, address, on)
-    ray.init(f"ray://{address}", **quiet)
+    try:
+        ray.init(f"ray://{address}", **quiet)
+    except ConnectionAbortedError:
+        # What the cluster starts for each client has been seen to die at its start now and then.
+        ray.shutdown()
+        ray.init(f"ray://{address}", **quiet)
 
 
 def _await_answer(grpc: Any, address: str, on: str) -> None:

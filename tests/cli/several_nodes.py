@@ -9,6 +9,8 @@ import socket
 import sys
 
 os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+# Its server for clients forks while it answers them, which gRPC's own handlers may not survive.
+os.environ["GRPC_ENABLE_FORK_SUPPORT"] = "0"
 os.environ["RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO"] = "0"
 
 from ray.cluster_utils import Cluster

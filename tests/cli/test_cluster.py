@@ -160,7 +160,9 @@ class FakeRay:
         self.cancelled: list[tuple[int, bool]] = []
         self.down = False
         names = "WorkerCrashedError NodeDiedError OutOfMemoryError TaskCancelledError RayTaskError"
-        self.exceptions = SimpleNamespace(**{n: type(n, (Exception,), {}) for n in names.split()})
+        error = type("RayError", (Exception,), {})
+        kinds = {name: type(name, (error,), {}) for name in names.split()}
+        self.exceptions = SimpleNamespace(RayError=error, **kinds)
 
     def nodes(self) -> list[dict[str, Any]]:
         return [{"Alive": True, "Resources": node} for node in self.alive]
@@ -260,6 +262,31 @@ def test_what_is_lost_goes_on_and_not_for_ever(
     assert len(fake.sent) == 1 + MOST_LOSSES + 1
 
 
+def test_what_else_ray_says_of_a_task_is_told(sent: Any) -> None:
+    _, path = sent(TWO, ["RayError", 0])
+    with pytest.raises(RunDirectoryError, match=r"seed1 failed.*: it is gone"):
+        go(path)
+
+
+def test_a_second_interrupt_ends_all_at_once(sent: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake, path = sent(TWO, ["going", "going"])
+    nodes = fake.wait
+
+    def wait(refs: list[int], timeout: float) -> Any:
+        if len(fake.sent) == 2 and not fake.cancelled:
+            for _, (signs, number, *_rest) in fake.sent:
+                carried.begun(signs, number).touch()
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+        return nodes(refs, timeout)
+
+    monkeypatch.setattr(fake, "wait", wait)
+    with pytest.raises(SystemExit) as ended:
+        go(path)
+    assert ended.value.code == 130
+    assert sorted(fake.cancelled) == [(0, True), (1, True)]
+
+
 def test_room_is_what_machines_offer_and_jobs_allow(sent: Any) -> None:
     fake, path = sent([{"CPU": 1.0, "memory": 9 * GIB}] * 2, ["going"] * 3)
     needs = {path / f"seed{k}": Need(memory=4 * GIB) for k in (1, 2)}
@@ -318,11 +345,12 @@ def started(words: str) -> "subprocess.Popen[str]":
     )
 
 
-def wait_for_rows(path: Path) -> None:
+def wait_for_rows(path: Path, training: "subprocess.Popen[str]") -> None:
     written = [path / f"seed{seed}" / "metrics.jsonl" for seed in (1, 2)]
     deadline = time.monotonic() + 300
     while not all(file.exists() and file.stat().st_size for file in written):
         assert time.monotonic() < deadline
+        assert training.poll() is None, training.communicate()[0]
         time.sleep(0.1)
 
 
@@ -352,7 +380,7 @@ def test_a_node_that_is_killed_costs_no_row(alone: Path, tmp_path: Path) -> None
         training = started(
             f"train probe/terminates --seeds 1,2 --run-dir {path} --on {address} {SMALL}"
         )
-        wait_for_rows(path)
+        wait_for_rows(path, training)
         time.sleep(2)
         nodes.stdin.write("1\n")
         nodes.stdin.flush()
@@ -370,7 +398,7 @@ def test_a_node_that_is_killed_costs_no_row(alone: Path, tmp_path: Path) -> None
 def test_an_interrupt_leaves_nothing_running_and_loses_nothing(alone: Path, tmp_path: Path) -> None:
     path = tmp_path / "runs"
     training = started(f"train probe/terminates --seeds 1,2 --run-dir {path} --on ray {SMALL}")
-    wait_for_rows(path)
+    wait_for_rows(path, training)
     training.send_signal(signal.SIGINT)
     said, _ = training.communicate(timeout=120)
     assert training.returncode == 130, said
