@@ -6,10 +6,10 @@ so that a first start and a later one are the same thing.
 
 import dataclasses
 import os
-import signal
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType, TracebackType
 from typing import Any, final
@@ -19,6 +19,9 @@ from rich.live import Live
 from rich.table import Table
 
 from race.cli import streams
+from race.cli.cluster import Cluster, check_address
+from race.cli.machines import Machines, ThisMachine
+from race.cli.needs import need_of
 from race.cli.worker import INTERRUPTED, Watched, Worker
 from race.compilation import cores
 from race.config.cohort import Batching, CohortConfig
@@ -35,23 +38,26 @@ MOST_SHOWN = 20
 """Runs that the display lists at once."""
 
 
-def check_jobs(jobs: int | None) -> None:
-    """Refuses a number of jobs that is none.
+def check_jobs(jobs: int | None, on: str | None = None) -> None:
+    """Refuses a number of jobs that is none, and what names no cluster.
 
     Raises:
-        ConfigError: if there would be none.
+        ConfigError: if there would be none, or nowhere.
     """
+    if on is not None:
+        check_address(on)
     if jobs is not None and jobs < 1:
         raise ConfigError(f"--jobs is {jobs}, but it must be at least 1.")
 
 
-def refuse_for_one_run(jobs: int | None, cohort: CohortConfig, told: str) -> None:
+def refuse_for_one_run(jobs: int | None, cohort: CohortConfig, on: str | None, told: str) -> None:
     """Refuses settings that are for several runs, where there is one.
 
     Raises:
         ConfigError: naming the first that was given; ``told`` says where it has no effect.
     """
-    for option, given in (("jobs", jobs is not None), ("cohort.*", cohort != CohortConfig())):
+    several = ("jobs", jobs is not None), ("cohort.*", cohort != CohortConfig())
+    for option, given in (*several, ("on", on is not None)):
         if given:
             raise ConfigError(f"--{option} has no effect {told}")
 
@@ -87,7 +93,7 @@ class _Signals:
         give_back(self._previous)
         for worker in self._workers:  # none is left where all went well
             if worker.process is not None:
-                worker.process.terminate()
+                worker.process.end()
 
     def _pass_on(self, number: int, frame: FrameType | None) -> None:
         self.requested = True
@@ -97,7 +103,7 @@ class _Signals:
     def stop(self, worker: Worker) -> None:
         """Asks one run to save and stop."""
         if worker.process is not None:
-            worker.process.send_signal(signal.SIGINT)
+            worker.process.interrupt()
 
 
 def crews(
@@ -131,6 +137,7 @@ def run_all(
     jobs: int | None = None,
     env_steps: int | None = None,
     cohort: CohortConfig | None = None,
+    on: str | None = None,
     console: Console | None = None,
 ) -> None:
     """Trains every unfinished run, some at a time. Exits with 130 on Ctrl-C.
@@ -142,13 +149,15 @@ def run_all(
             cores, or as accelerators.
         env_steps: a new budget for all.
         cohort: which runs share a process.
+        on: the cluster that they run on (`race.cli.cluster`); None: this machine.
         console: where it is shown.
 
     Raises:
         RunDirectoryError: if a run failed; the others are trained to their end first.
         ConfigError: if there would be no job at a time, or nothing to extend.
+        RaceError: if the cluster cannot be used.
     """
-    check_jobs(jobs)
+    check_jobs(jobs, on)
     cohort = cohort or CohortConfig()
     console = console or streams.console(tolerant=True)
     if env_steps is not None:
@@ -156,25 +165,35 @@ def run_all(
     runs = [Watched(run, run_directory.open_run(run)) for run in places]
     for run in runs:
         run.look()
-    devices = accelerators()
-    groups = crews(runs, cohort.batching, cohort.width, devices)
-    workers = [Worker(group, cohort.batching) for group in groups]
-    usable = cores()
-    jobs = min(jobs or devices or max(len(usable), 1), len(workers))
-    pinned = jobs > 1 and usable and not devices
-    named = _names_of(devices)
-    free: list[tuple[int | None, str | None]] = [
-        (usable[k % len(usable)] if pinned else None, named[k % devices] if devices else None)
-        for k in range(jobs)
-    ]
+    with ExitStack() as stack:
+        cluster: Cluster | None = None
+        if on is not None and any(run.ended is None for run in runs):
+            with console.status(f"connecting to {on}"):
+                cluster = stack.enter_context(Cluster(on, path))
+        devices = accelerators() if cluster is None else cluster.gpus
+        groups = crews(runs, cohort.batching, cohort.width, devices)
+        workers = [Worker(group, cohort.batching) for group in groups]
+        if cluster is None:
+            machines: Machines = _this_machine(jobs, len(workers), devices)
+        else:
+            cluster.plan({w.runs[0].path: need_of(w.runs, devices) for w in workers}, jobs)
+            machines = cluster
+        _watch(runs, workers, machines, console)
+    _say_how_it_ended(path, workers, console)
+
+
+def _watch(
+    runs: Sequence[Watched], workers: Sequence[Worker], machines: Machines, console: Console
+) -> None:
+    """Starts processes as there is room for them, and shows how they get on, to the end."""
     with (
         _Signals(workers) as signals,
         Live(console=console, refresh_per_second=2, transient=True) as live,
     ):
         while True:
             waiting = [worker for worker in workers if worker.waiting]
-            if waiting and free and not signals.requested:
-                waiting[0].start(*free.pop(0))
+            if waiting and not signals.requested and machines.room():
+                waiting[0].start(machines.start)
                 if signals.requested:  # between the start and the noting of it
                     signals.stop(waiting[0])
                 continue
@@ -182,17 +201,30 @@ def run_all(
                 for run, row in worker.look():
                     console.print(_line(run, row), soft_wrap=True)
                 if worker.process is None:
-                    free.append((worker.core, worker.device))
                     for run in worker.runs:
-                        if signals.requested and run.ended == "failed":
+                        if signals.requested and run.ended in ("failed", None):
                             # Stopped before it could listen; nothing is lost.
                             run.ended = "interrupted"
-                        console.print(f"{run.name}: {run.stage}")
+                        lost = "its machine was lost; it goes on from its last checkpoint"
+                        console.print(f"{run.name}: {lost if worker.lost else run.stage}")
             live.update(_table(runs))
-            if not any(w.process for w in workers) and (signals.requested or not waiting):
+            left = not signals.requested and any(worker.waiting for worker in workers)
+            if not left and not any(worker.process for worker in workers):
                 break
             time.sleep(LOOK_EVERY)
-    _say_how_it_ended(path, workers, console)
+
+
+def _this_machine(jobs: int | None, processes: int, devices: int) -> ThisMachine:
+    usable = cores()
+    jobs = min(jobs or devices or max(len(usable), 1), processes)
+    pinned = jobs > 1 and usable and not devices
+    named = _names_of(devices)
+    return ThisMachine(
+        [
+            (usable[k % len(usable)] if pinned else None, named[k % devices] if devices else None)
+            for k in range(jobs)
+        ]
+    )
 
 
 def accelerators() -> int:

@@ -11,6 +11,7 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
     """Lists runs, the process of each, its replay buffer's memory, and the time that is left."""
     from race.cli import streams
     from race.cli.fleet import accelerators, crews
+    from race.cli.needs import replay_bytes
     from race.runs import directory as run_directory
 
     console = streams.console()
@@ -24,7 +25,7 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
             config = run.config
             key = (config.task, config.env, config.env_steps, repr(config.learner), config.facmac)
             if key not in sizes:
-                sizes[key] = _replay_bytes(config)
+                sizes[key] = replay_bytes(config)
             there = run_directory.RunDirectory(run.path).config.exists()
             state = run.ended or ("begun" if there else "new")
             steps, size = f"{config.env_steps:,}", f"{sizes[key] / 1e9:.2f} GB"
@@ -37,18 +38,6 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
         soft_wrap=True,
     )
     console.print(_time_left(watched), soft_wrap=True)
-
-
-def _replay_bytes(config: Any) -> int:
-    """Memory of a run's replay buffer."""
-    import jax
-
-    from race.envs import make_task
-    from race.rollouts import rollouts_of
-
-    with rollouts_of(config, make_task(config.task, config.env)) as rollouts:
-        shapes = jax.eval_shape(lambda: rollouts.empty_replay(config))
-    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
 
 
 def _time_left(runs: list[Watched]) -> str:

@@ -93,7 +93,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
         recording = play(played, POLICIES[policy], chosen.seed, most_steps)
-    drawn = of_battle(played, recording, policy, out.suffix.lower() == ".gif")
+    drawn = of_battle(played, recording, policy, small=out.suffix.lower() == ".gif")
     _write(drawn, f"{policy} policy", out, console)
 
 

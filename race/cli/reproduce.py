@@ -48,6 +48,9 @@ class Reproduce:
     """The same plan on so much of the budget: 0.1 is a tenth."""
     jobs: int | None = None
     """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    on: Annotated[str | None, tyro.conf.arg(metavar="CLUSTER")] = None
+    """Run them on a Ray cluster: ray://HOST:PORT, or ray, which starts one of this machine. Runs
+    must lie in a folder that all machines share. Needs race-marl[ray]; see docs/cluster.md."""
     dir: Path = Path("runs/reproduce")
     """Where runs and figures are kept."""
     dry_run: bool = False
@@ -83,7 +86,7 @@ def main(arguments: list[str]) -> None:
 
     if not chosen.figures:
         raise ConfigError("Say which figure: race reproduce {fig2,...,fig8,all}")
-    check_jobs(chosen.jobs)
+    check_jobs(chosen.jobs, chosen.on)
     figures = tuple(FIGURES) if "all" in chosen.figures else tuple(dict.fromkeys(chosen.figures))
     groups = ("learner", "facmac", "race", "evaluation", "checkpoint", "compute")
     made = plan(
@@ -105,7 +108,7 @@ def main(arguments: list[str]) -> None:
         create_runs(chosen.dir, made.runs, chosen.log)
         places = [chosen.dir / name for name in made.runs]
         try:
-            run_all(chosen.dir, places, jobs=chosen.jobs, cohort=chosen.cohort)
+            run_all(chosen.dir, places, jobs=chosen.jobs, cohort=chosen.cohort, on=chosen.on)
         except RaceError as error:  # what the others did is drawn all the same
             failure = error
     _draw(chosen, figures, made)

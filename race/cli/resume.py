@@ -29,6 +29,9 @@ class Resume:
     jobs: int | None = None
     """If DIR holds several runs: so many processes at a time. None: as many as cores, or as
     accelerators."""
+    on: Annotated[str | None, tyro.conf.arg(metavar="CLUSTER")] = None
+    """If DIR holds several runs: go on with them on a Ray cluster, ray://HOST:PORT, or ray, which
+    starts one of this machine."""
     cohort: CohortConfig = field(default_factory=CohortConfig)
 
 
@@ -50,9 +53,11 @@ def main(arguments: list[str]) -> None:
             jobs=chosen.jobs,
             env_steps=chosen.env_steps,
             cohort=chosen.cohort,
+            on=chosen.on,
         )
         return
-    refuse_for_one_run(chosen.jobs, chosen.cohort, f"on {chosen.run_dir}, which is one run.")
+    told = f"on {chosen.run_dir}, which is one run."
+    refuse_for_one_run(chosen.jobs, chosen.cohort, chosen.on, told)
     config = run_directory.open_run(chosen.run_dir)
     if chosen.env_steps is not None:
         config = resolve(dataclasses.replace(config, env_steps=chosen.env_steps))

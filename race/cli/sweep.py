@@ -41,6 +41,9 @@ class Sweep:
     """Say what would be run, and run nothing."""
     jobs: int | None = None
     """Processes at a time, each kept on one core. None: as many as cores, or as accelerators."""
+    on: Annotated[str | None, tyro.conf.arg(metavar="CLUSTER")] = None
+    """Run them on a Ray cluster: ray://HOST:PORT, or ray, which starts one of this machine. Runs
+    must lie in a folder that all machines share. Needs race-marl[ray]; see docs/cluster.md."""
     log: tuple[LoggerName, ...] = ()
     """Programs that new runs tell every row besides (`race train --help`)."""
     cohort: CohortConfig = field(default_factory=CohortConfig)
@@ -53,7 +56,7 @@ def main(arguments: list[str]) -> None:
     from race.cli.worker import SHARED_ACCELERATOR
     from race.compilation import use_cache
 
-    check_jobs(chosen.jobs)
+    check_jobs(chosen.jobs, chosen.on)
     os.environ.update(SHARED_ACCELERATOR)  # this process only watches
     use_cache()
     runs = _planned(_read(chosen.file))
@@ -64,7 +67,9 @@ def main(arguments: list[str]) -> None:
         show_plan(path, runs, chosen.cohort)
         return
     create_runs(path, runs, chosen.log)
-    run_all(path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort)
+    run_all(
+        path, [path / name for name in runs], jobs=chosen.jobs, cohort=chosen.cohort, on=chosen.on
+    )
 
 
 def _read(file: Path) -> dict[str, Any]:

@@ -58,6 +58,10 @@ class Train:
     jobs: int | None = None
     """With --seeds: processes at a time, each kept on one core. None: as many as cores, or as
     accelerators."""
+    on: Annotated[str | None, tyro.conf.arg(metavar="CLUSTER")] = None
+    """With --seeds: run them on a Ray cluster: ray://HOST:PORT, or ray, which starts one of this
+    machine. Runs must lie in a folder that all machines share. Needs race-marl[ray];
+    docs/cluster.md."""
     env_steps: int = 1_000_000
     """Environment steps to train for, those of all teams counted."""
     config: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
@@ -122,7 +126,7 @@ def main(arguments: list[str]) -> None:
     name = str(chosen.config)
     config = settled_with_file(asked, chosen.preset, chosen.ablation, task, file, name)
     if chosen.seeds is None:
-        refuse_for_one_run(chosen.jobs, chosen.cohort, "without --seeds. Leave it out.")
+        refuse_for_one_run(chosen.jobs, chosen.cohort, chosen.on, "without --seeds. Leave it out.")
         path = chosen.run_dir or usual_directory(config)
         run_directory.refuse_occupied(path)
         begins_with = initial_teams(config, task)
@@ -132,7 +136,7 @@ def main(arguments: list[str]) -> None:
         return
     path = chosen.run_dir or Path("runs") / name_of(config)
     _create_all(path, config, chosen, file, task)
-    run_all(path, directories_of(path), jobs=chosen.jobs, cohort=chosen.cohort)
+    run_all(path, directories_of(path), jobs=chosen.jobs, cohort=chosen.cohort, on=chosen.on)
 
 
 def tried(task_id: str, task: AnyTask) -> dict[str, Any]:
@@ -157,7 +161,7 @@ def _create_all(path: Path, config: Config, chosen: Train, file: Wanted, task: A
     seeds = parse_seeds(str(chosen.seeds))
     if chosen.seed != file.settings.get("seed", 1):
         raise ConfigError("--seed and --seeds are two ways to say it; leave one out.")
-    check_jobs(chosen.jobs)
+    check_jobs(chosen.jobs, chosen.on)
     configs = [resolve(dataclasses.replace(config, seed=seed)) for seed in seeds]
     places = [path / f"seed{seed}" for seed in seeds]
     for place in (path, *places):

@@ -3,9 +3,9 @@
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, final
+from typing import Any, Protocol, final, runtime_checkable
 
 from race.config.cohort import Batching
 from race.config.settings import Config
@@ -14,6 +14,10 @@ from race.runs.directory import RunDirectory
 from race.runs.sealed import parse
 
 INTERRUPTED = 130
+LOST = -1000
+"""Instead of an exit status: the machine is gone, or the process was taken from it."""
+MOST_LOSSES = 3
+"""Machines in a row that may be lost before a run has got any further."""
 _SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
@@ -73,6 +77,57 @@ class Watched:
         return self.path.name
 
 
+@runtime_checkable
+class Process(Protocol):
+    """A process that goes on with some runs, wherever it is."""
+
+    def poll(self) -> int | None:
+        """Its exit status, None while it goes on, `LOST` if its machine is gone."""
+
+    def interrupt(self) -> None:
+        """Asks it to save and stop."""
+
+    def end(self) -> None:
+        """Ends it at once."""
+
+    def told(self) -> str:
+        """What is known of its end besides what it has written to its log."""
+
+
+def command_for(paths: Sequence[Path], batching: Batching) -> list[str]:
+    """What goes on with some runs in one process."""
+    places = [str(path) for path in paths]
+    if len(places) == 1:
+        return [sys.executable, "-m", "race", "resume", *places]
+    return [sys.executable, "-m", "race.cli.cohort", batching, *places]
+
+
+def environment_for(core: int | None) -> dict[str, str]:
+    """The variables of that process; with one thread if it is kept on one core."""
+    return os.environ | SHARED_ACCELERATOR | ({} if core is None else _SINGLE_THREADED)
+
+
+def start_here(
+    paths: Sequence[Path], batching: Batching, log: Path, core: int | None, device: str | None
+) -> "subprocess.Popen[bytes]":
+    """Goes on with some runs on this machine, on one core or one accelerator if one is named."""
+    environment = environment_for(core)
+    if device is not None:
+        environment |= {"CUDA_VISIBLE_DEVICES": device}
+    with log.open("ab") as words:
+        # A session of its own: Ctrl-C reaches this process, which passes it on once.
+        process = subprocess.Popen(
+            command_for(paths, batching),
+            stdout=words,
+            stderr=words,
+            env=environment,
+            start_new_session=True,
+        )
+    if core is not None and hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(process.pid, {core})
+    return process
+
+
 @final
 class Worker:
     """One run or a cohort of some and, once started, its process.
@@ -81,48 +136,49 @@ class Worker:
     """
 
     def __init__(self, runs: Sequence[Watched], batching: Batching) -> None:
-        self.runs, self._batching = list(runs), batching
-        self.process: subprocess.Popen[bytes] | None = None
-        self.core: int | None = None
-        self.device: str | None = None
+        self.runs, self.batching = list(runs), batching
+        self.process: Process | None = None
+        self.lost = False
+        """Whether its last process was lost with its machine."""
+        self._losses = 0  # since the runs last got further
+        self._reached: list[int] = []
+        self._told = ""
 
     @property
     def waiting(self) -> bool:
         """Whether something is left to do, and nobody does it."""
         return self.process is None and any(run.ended is None for run in self.runs)
 
-    def start(self, core: int | None, device: str | None = None) -> None:
-        """Goes on with the runs, on one core or one accelerator if one is named."""
-        paths = [str(run.path) for run in self.runs if run.ended is None]
-        command = [sys.executable, "-m", "race", "resume", *paths]
-        if len(paths) > 1:
-            command = [sys.executable, "-m", "race.cli.cohort", self._batching, *paths]
-        environment = os.environ | SHARED_ACCELERATOR | ({} if core is None else _SINGLE_THREADED)
-        if device is not None:
-            environment |= {"CUDA_VISIBLE_DEVICES": device}
-        with self._log.open("ab") as log:
-            # A session of its own: Ctrl-C reaches this process, which passes it on once.
-            self.process = subprocess.Popen(
-                command, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
-        self.core, self.device = core, device
+    def start(self, take: Callable[[Sequence[Path], Batching, Path], Process]) -> None:
+        """Goes on with the runs, wherever ``take`` does."""
+        paths = [run.path for run in self.runs if run.ended is None]
+        self.process, self.lost = take(paths, self.batching, self._log), False
         for run in self.runs:
             run.training = run.ended is None
-        if core is not None and hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(self.process.pid, {core})
 
     def look(self) -> list[tuple[Watched, dict[str, Any]]]:
         """Reads what the runs have written since the last look; returns new evaluations."""
-        code = None if self.process is None else self.process.poll()
+        process = self.process
+        code = None if process is None else process.poll()
         new = [(run, row) for run in self.runs for row in run.look()]
-        if code is not None:
-            self.process = None
+        if process is not None and code is not None:
+            self.process, self._told = None, process.told()
             for run in [run for run in self.runs if run.ended is None]:
                 run.training = False
                 run.ended = {0: "finished", INTERRUPTED: "interrupted"}.get(code, "failed")
                 if run_directory.is_finished(run.path):
                     run.ended = "finished"
+                elif code == LOST and self._may_go_on():
+                    run.ended = None
+            self.lost = self.waiting
         return new
+
+    def _may_go_on(self) -> bool:
+        """Whether a lost machine was no fault of the runs: not if they get no further."""
+        reached = [run.row.get("env_steps", 0) for run in self.runs]
+        self._losses = self._losses + 1 if reached == self._reached else 1
+        self._reached = reached
+        return self._losses <= MOST_LOSSES
 
     @property
     def _log(self) -> Path:
@@ -130,6 +186,8 @@ class Worker:
 
     def complaint(self, run: Watched) -> str:
         """The last lines that were said of a failed run."""
+        if self._told:
+            return self._told
         lines = self._log.read_text(errors="replace").strip().splitlines()
         own = [line for line in lines if str(run.path) in line] if len(self.runs) > 1 else []
         return "\n".join((own or lines)[-3:])

@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from race.config.effects import NETWORKS
@@ -17,6 +18,8 @@ class Recorded(NamedTuple):
     config: Config
     rows: list[dict[str, Any]]
     metadata: dict[str, Any]
+    place: Path | None = None
+    """The run's directory, where it still is; None of a run from an archive."""
 
     @property
     def algorithm_version(self) -> int:

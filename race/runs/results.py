@@ -40,7 +40,7 @@ def of_directory(path: Path) -> Recorded:
     # Before the rows, which are the newer then and hold all that it knows of.
     kept = checkpoints.metrics_extent(run.checkpoints)
     rows = metrics.read(run.metrics, identity, kept) if run.metrics.exists() else []
-    return Recorded(str(path), config, rows, run_directory.read_metadata(path))
+    return Recorded(str(path), config, rows, run_directory.read_metadata(path), path)
 
 
 def _places_in(path: Path) -> list[Path]:

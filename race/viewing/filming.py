@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from race.envs.micro import make
+from race.envs.micro import Battle, make
 from race.envs.micro.recording import Recording, replay
 from race.rollouts.discrete import EpisodeRollouts
 from race.teams.trained import Trained
@@ -77,13 +77,19 @@ def film(
     )
 
 
-def write(drawn: Film, out: Path, each: Callable[[int], None] = lambda frames: None) -> int:
+def write(
+    drawn: Film,
+    out: Path,
+    each: Callable[[int], None] = lambda frames: None,
+    most_bytes: int | None = None,
+) -> int:
     """Plays, draws and writes a film; returns the number of frames.
 
     Args:
         drawn: the film.
         out: an .mp4 or .gif.
         each: told whenever a frame has been drawn.
+        most_bytes: how large an .mp4 may become: the more it shows, the less sharp it is.
 
     Raises:
         RaceError: if it cannot be played, drawn or written.
@@ -94,7 +100,9 @@ def write(drawn: Film, out: Path, each: Callable[[int], None] = lambda frames: N
             each(1)
             yield frame
 
-    return write_video(frames(), out, drawn.fps)
+    # A second for what is written beside the pictures.
+    rate = None if most_bytes is None else 8 * most_bytes / (drawn.total / drawn.fps + 1)
+    return write_video(frames(), out, drawn.fps, rate)
 
 
 def _drawn(episode: Any) -> Film:
@@ -107,7 +115,24 @@ def _drawn(episode: Any) -> Film:
 
 
 def _battle(trained: Trained, team: str, seed: int, seconds: float, small: bool) -> Film:
-    """A battle is a function of its seed and the actions, so it can be played twice."""
+    name = LABELS[trained.resolve(team)]
+    return of_battle(*battle_of(trained, team, seed, seconds), name, small=small)
+
+
+def battle_of(trained: Trained, team: str, seed: int, seconds: float) -> tuple[Battle, Recording]:
+    """A battle of a team, as a map and what happened on it.
+
+    A battle is a function of its seed and the actions, so it can be played twice.
+
+    Args:
+        trained: the teams of a run whose task is a battle.
+        team: as `film`.
+        seed: of the episode.
+        seconds: simulated time to play; 0 for the whole battle.
+
+    Raises:
+        RaceError: if it cannot be played.
+    """
     assert isinstance(trained.task, DiscreteTask)
     name = trained.resolve(team)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
@@ -117,11 +142,11 @@ def _battle(trained: Trained, team: str, seed: int, seconds: float, small: bool)
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     played = make(trained.config.task.removeprefix("micro/"))
-    return of_battle(played, replay(played, actions, seed), LABELS[name], small)
+    return played, replay(played, actions, seed)
 
 
-def of_battle(played: Any, recording: Recording, team: str, small: bool) -> Film:
-    """A film of a battle that was recorded, in the name of a team."""
+def of_battle(played: Battle, recording: Recording, team: str, *, small: bool) -> Film:
+    """A film of a battle that was recorded, in the name of a team; small, it is 960 x 540."""
     from race.envs.micro import render
     from race.envs.micro.canvas import LARGE, SMALL
 

@@ -256,10 +256,21 @@ def frames_per_second(env: Any, otherwise: float) -> float:
     return float(said)
 
 
-def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> int:
+def write_video(
+    frames: Iterator[NDArray[np.uint8]],
+    path: Path,
+    fps: float,
+    bits_per_second: float | None = None,
+) -> int:
     """Writes an .mp4 (H.264, plays everywhere) or a looping .gif; returns the number of frames.
 
     The file appears when it is complete.
+
+    Args:
+        frames: images [height, width, 3].
+        path: the file.
+        fps: frames per second.
+        bits_per_second: the most that an .mp4 may take of any second; None: what it needs.
 
     Raises:
         RenderError: for another ending, or if the file cannot be written.
@@ -276,6 +287,9 @@ def write_video(frames: Iterator[NDArray[np.uint8]], path: Path, fps: float) -> 
             # The slowest preset with which one core draws and writes battles as fast as they run.
             "output_params": ["-preset", "superfast", "-crf", "20"],
         }
+        if bits_per_second is not None:
+            most = f"{int(bits_per_second)}"
+            options["output_params"] += ["-maxrate", most, "-bufsize", most]
     elif ending == ".gif":
         options = {"duration": 1000 / fps, "loop": 0}
     else:

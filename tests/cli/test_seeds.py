@@ -8,12 +8,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from commands import fails, race
 from whole_runs import rows
 
-from race.cli import fleet
+from race.cli import fleet, machines
 from race.cli.fleet import directories_of
 from race.config.seeds import parse_seeds
 from race.errors import ConfigError
@@ -76,7 +77,7 @@ def test_a_new_budget_is_everybodys_before_anybody_goes_on(
     """Stopped before the second has its turn, a plain resume still knows of it."""
     path = Path(shutil.copytree(both, tmp_path / "runs"))
 
-    def stop_at_once(self: fleet.Worker, core: int | None, device: str | None = None) -> None:
+    def stop_at_once(self: fleet.Worker, take: Any) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as stopped:
@@ -140,46 +141,47 @@ def test_an_interrupt_stops_all_and_they_go_on_number_for_number(tmp_path: Path)
     assert rows(path / "seed1") == rows(tmp_path / "alone")
 
 
-def test_runs_have_a_core_each_where_there_are_enough(
-    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+class Ended(subprocess.Popen[bytes]):
+    """A process that has ended at once."""
+
+    def __init__(self) -> None:
+        """Starts none."""
+
+    def poll(self) -> int:
+        return 0
+
+
+@pytest.fixture
+def cores(monkeypatch: pytest.MonkeyPatch) -> list[int | None]:
+    """The cores on which processes were to be started, in their order."""
     started: list[int | None] = []
 
-    class Process:
-        pid = 0
-
-        def poll(self) -> int:
-            return 0
-
-    def start(self: fleet.Worker, core: int | None, device: str | None = None) -> None:
+    def start(paths: Any, batching: Any, log: Any, core: int | None, device: str | None) -> Ended:
         started.append(core)
-        self.core, self.process = core, Process()  # type: ignore[assignment]
+        return Ended()
 
-    monkeypatch.setattr(fleet.Worker, "start", start)
+    monkeypatch.setattr(machines, "start_here", start)
+    return started
+
+
+def test_runs_have_a_core_each_where_there_are_enough(
+    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: list[int | None]
+) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3, 5})
     path = Path(shutil.copytree(both, tmp_path / "runs"))
     fleet.run_all(path, directories_of(path), jobs=2, env_steps=500)
-    assert started == [3, 5]
-    started.clear()
+    assert cores == [3, 5]
+    cores.clear()
     fleet.run_all(
         path, directories_of(path), jobs=1, env_steps=600
     )  # alone, a run may use them all
-    assert started == [None, None]
+    assert cores == [None, None]
 
 
 def test_more_jobs_than_cores_share_them(
-    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    both: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cores: list[int | None]
 ) -> None:
-    started: list[int | None] = []
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {3})
-    monkeypatch.setattr(
-        fleet.Worker,
-        "start",
-        lambda self, core, device: (
-            started.append(core),
-            setattr(self.runs[0], "ended", "finished"),
-        ),
-    )
     path = Path(shutil.copytree(both, tmp_path / "runs"))
     fleet.run_all(path, directories_of(path), jobs=2, env_steps=500)
-    assert started == [3, 3]
+    assert cores == [3, 3]

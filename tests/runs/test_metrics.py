@@ -215,3 +215,19 @@ def test_a_full_disk_is_told_and_leaves_whole_rows(path: Path) -> None:
         writer.write({"n": 3})
         assert writer.offset == path.stat().st_size
     assert numbers(path) == [1, 3]
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ['{"n": [1', "2]}"],  # one object over two lines
+        ['{"n": 1}, {"n": 2}'],  # two objects in one
+        ['{"n": [1', '2]}, {"n": 2}, {"n": 3}'],  # both: as many as there are lines
+        ['{"n": 1}', "0"],
+        ['{"n": 1}', ""],
+    ],
+)
+def test_lines_are_rows_and_nothing_else_is(path: Path, lines: list[str]) -> None:
+    path.write_text("\n".join(['{"n": 0}', *lines, ""]))
+    with pytest.raises(RunDirectoryError, match=r"Line [23] of .* is no row of metrics"):
+        read(path)

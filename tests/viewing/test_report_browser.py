@@ -46,6 +46,19 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> str:
     return (folder / "page.html").as_uri()
 
 
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A page with battles and videos of two runs that were trained for a moment."""
+    folder = tmp_path_factory.mktemp("shown")
+    tiny = "--env-steps 130 --evaluation.episodes 1 --facmac.batch-size 2"
+    for seed in ("1", "2"):
+        words = ["train", "micro/3m", *tiny.split(), "--seed", seed]
+        main([*words, "--run-dir", str(folder / seed)])
+    words = ["--replays", "all", "--videos", "--out", str(folder / "page.html")]
+    main(["report", str(folder), *words])
+    return (folder / "page.html").as_uri()
+
+
 class Window:
     """A page with all that it said and asked for."""
 
@@ -130,6 +143,76 @@ def test_evolution_is_drawn_as_recorded(browser: Any, address: str) -> None:
     assert sorted(edges) == [(1, 2), (1, 3), (2, 3), (2, 3)]
     assert sum(won[0][3]) == 3
     assert [name for name, *_ in injected] == ["elite"]
+
+
+def test_battles_can_be_stepped_through(browser: Any, shown: str) -> None:
+    window = Window(browser, shown, width=390)
+    window.wait("document.querySelector('#fought canvas')")
+    page, canvas = window.page, window.page.locator("#fought canvas")
+
+    def step() -> int:
+        return int(page.locator("#fought > div").get_attribute("data-step"))
+
+    def picture() -> str:
+        return str(canvas.evaluate("c => c.toDataURL()"))
+
+    last = int(page.locator("#fought input").get_attribute("max"))
+    assert 0 < last <= 60
+    assert step() == 0
+    first = picture()
+    canvas.focus()
+    for key, expected in (("ArrowLeft", 0), ("ArrowRight", 1), ("End", last), ("ArrowRight", last)):
+        page.keyboard.press(key)
+        assert step() == expected
+    assert f"step {last} of {last}" in page.locator("#fought output").text_content()
+    assert picture() != first
+    page.locator("#fought input").evaluate(
+        "s => { s.value = 3; s.dispatchEvent(new Event('input')); }"
+    )
+    assert step() == 3
+    page.keyboard.press("Home")
+    assert picture() == first
+    page.select_option("#fought select", "4")
+    page.locator("#fought button").click()
+    window.wait("Number(document.querySelector('#fought > div').dataset.step) >= 4")
+    assert "pause" in page.locator("#fought button").text_content()
+    canvas.focus()
+    page.keyboard.press(" ")
+    stopped = step()
+    assert "play" in page.locator("#fought button").text_content()
+    # The other run, by filter and by choice.
+    page.select_option("#battle", index=1)
+    window.wait("document.querySelector('#fought > div')?.dataset.step === '0'")
+    assert stopped >= 4
+    page.locator("#seeds input[value='2']").click()
+    assert page.locator("#battle option").count() == 1
+    window.wait("document.querySelector('#fought canvas')")
+    page.locator("#seeds input[value='1']").click()
+    assert "No battle" in page.locator("#fought").text_content()
+    assert window.page.evaluate("document.documentElement.scrollWidth") == 390
+    assert window.said == []
+
+
+def test_videos_play_and_distances_are_drawn(browser: Any, shown: str) -> None:
+    window = Window(browser, shown)
+    assert window.page.locator("#videos video").count() == 2
+    window.wait("[...document.querySelectorAll('video')].every(v => v.readyState > 0)")
+    told = "[...document.querySelectorAll('video')].map(v => [v.duration, v.videoWidth])"
+    for duration, width in window.page.evaluate(told):
+        assert duration > 0.5
+        assert width == 960
+    sizes = "JSON.parse(document.getElementById('content').textContent).runs.map(r => r.video.data)"
+    assert all(len(data) < 2e6 for data in window.page.evaluate(sizes))
+    (heat,) = window.page.evaluate(
+        "[...document.querySelectorAll('#evolution .chart')].map(c => c.data[0])"
+        ".filter(t => t.type === 'heatmap')"
+    )
+    assert [name.split()[0] for name in heat["x"]] == ["team"] * 5 + ["MARL"]
+    assert [row[k] for k, row in enumerate(heat["z"])] == [0] * 6
+    window.page.locator("#seeds input[value='2']").click()
+    assert window.page.locator("#videos video").count() == 1
+    assert window.said == []
+    assert [url for url in window.asked if not url.startswith("blob:")] == [shown]
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])

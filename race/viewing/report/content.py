@@ -15,6 +15,7 @@ from race.viewing.comparison import compare
 from race.viewing.curves import Axis
 from race.viewing.plotting import colours_of
 from race.viewing.report import evolution
+from race.viewing.report.made import Made
 from race.viewing.scores import scores_of, tests_and_end
 from race.viewing.tables import LEGEND, as_json, estimate, remarks, seconds, tables_of
 
@@ -23,6 +24,7 @@ TEAMS = ("selected", "marl", "champion", "best")
 MOST_POINTS = 150
 DIGITS = 5
 _TRAINING = ("loss/", "time/", "injection/", "operators/", "population/", "marl/")
+_NUMBER = (int, float)
 _AXES: tuple[Axis, ...] = ("env_steps", "wall_time")
 _FATES = ("injection/elite_rate", "injection/parent_rate", "injection/discarded_rate")
 _BETTER = tuple(
@@ -30,7 +32,13 @@ _BETTER = tuple(
 )
 
 
-def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | None) -> Any:
+def content_of(
+    runs: Sequence[Recorded],
+    metric: str,
+    team: str,
+    base: str | None,
+    made: Made | None = None,
+) -> Any:
     """Everything on the page.
 
     Args:
@@ -38,6 +46,7 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         metric: as `race.viewing.scores.scores_of`.
         team: whose tests the tables are about.
         base: as `race.viewing.comparison.compare`.
+        made: what was made of the runs' checkpoints.
 
     Raises:
         RaceError: if no run has a row yet, or two are the same.
@@ -46,6 +55,7 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         raise chosen.no_values(runs, "return_mean")
     chosen.refuse_twins(runs)
     names = chosen.names_of(runs)
+    made = made or Made({}, [])
     tables: list[dict[str, Any]] = []
     comparison, said = None, []
     try:
@@ -65,7 +75,11 @@ def content_of(runs: Sequence[Recorded], metric: str, team: str, base: str | Non
         "kinds": list(evolution.KINDS),
         "colours": colours_of(sorted(set(names))),
         "bands": _bands(runs, names),
-        "runs": [_run(run, name) for run, name in zip(runs, names, strict=True)],
+        "not_made": made.remarks,
+        "runs": [
+            _run(run, name) | made.of_runs.get(run.name, {})
+            for run, name in zip(runs, names, strict=True)
+        ],
     }
 
 
@@ -81,7 +95,7 @@ def _run(run: Recorded, method: str) -> dict[str, Any]:
     keys = [f"eval/{team}/{metric}" for team in TEAMS for metric in TEST_METRICS]
     told = sorted({key for row in training for key in row if key.startswith(_TRAINING)})
     last = run.rows[-1] if run.rows else {}
-    lineage = bool(evolution.generations_of(run.rows))
+    story = evolution.Story(run.rows)
     return {
         "name": run.name,
         "task": run.config.task,
@@ -98,9 +112,9 @@ def _run(run: Recorded, method: str) -> dict[str, Any]:
         },
         "tests": _columns(_thinned(tests), keys),
         "training": _columns(training, told),
-        "teams": evolution.fitness_of_teams(run.rows) if lineage else None,
-        "ancestry": _rounded(evolution.ancestry(run.rows)) if lineage else None,
-        "winners": evolution.winners(run.rows) if lineage else None,
+        "teams": evolution.fitness_of_teams(story) if story.rows else None,
+        "ancestry": _rounded(evolution.ancestry(story)) if story.rows else None,
+        "winners": evolution.winners(story) if story.rows else None,
         "population": run.config.has_population,
     }
 
@@ -126,12 +140,13 @@ def _thinned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def _binned(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Means over generations in a row, so that there are at most `MOST_POINTS`."""
     step = max(1, -(-len(rows) // MOST_POINTS))
+    told = [key for key in set().union(*rows) if key.startswith(_TRAINING)]
     found = []
     for begin in range(0, len(rows), step):
         bin_ = rows[begin : begin + step]
         one = {key: bin_[-1].get(key) for key in ("env_steps", "wall_seconds")}
-        for key in {key for row in bin_ for key in row if key.startswith(_TRAINING)}:
-            values = [v for row in bin_ if isinstance(v := row.get(key), int | float)]
+        for key in told:
+            values = [v for row in bin_ if isinstance(v := row.get(key), _NUMBER)]
             one[key] = sum(values) / len(values) if values else None
         found.append(one)
     return found
@@ -187,17 +202,18 @@ def _fates(runs: Sequence[Recorded], names: Sequence[str]) -> dict[str, Any]:
         mine = [r for r, n in zip(runs, names, strict=True) if (r.config.task, n) == (task, name)]
         line = []
         for key in (*_FATES, *_BETTER):
-            ends = [
-                values[-1]
-                for run in mine
-                if (values := [row[key] for row in run.rows if row.get(key) is not None])
-            ]
+            last = (_last(run.rows, key) for run in mine)
+            ends = [value for value in last if value is not None]
             line.append(estimate(mean_estimate(ends, (0.0, 1.0)), percent=True) if ends else "-")
         if set(line) != {"-"}:
             rows.append([task, name, str(len(mine)), *line])
     heads = ["became elite", "became parent", "was discarded"]
     heads += ["crossover better", "mutation better", "both better"]
     return {"columns": ["task", "method", "seeds", *heads], "rows": rows}
+
+
+def _last(rows: Sequence[dict[str, Any]], key: str) -> Any:
+    return next((row[key] for row in reversed(rows) if row.get(key) is not None), None)
 
 
 def _short(value: Any) -> Any:

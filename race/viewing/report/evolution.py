@@ -1,7 +1,7 @@
 """What evolution did in a run, from the lineage in its rows."""
 
-from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, NamedTuple, final
 
 KINDS = (
     *("initial", "unchanged", "crossover", "mutation", "crossover and mutation"),
@@ -21,34 +21,42 @@ class Born(NamedTuple):
     parents: tuple[int, ...]  # ids
 
 
-def generations_of(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows that tell of teams; archives keep none."""
-    return [row for row in rows if isinstance(row.get("teams"), list) and row["teams"]]
+@final
+class Story:
+    """All teams of a run that ever played. How each came about is looked up when it is asked for.
 
-
-def births(rows: Sequence[dict[str, Any]]) -> dict[int, Born]:
-    """Every team that ever played, by its id.
-
-    A parent that mutation changed keeps its place, so that the team there before is its parent.
+    Attributes:
+        rows: those that tell of teams; archives keep none.
+        ids: of the teams, in the order in which they first played.
     """
-    found: dict[int, Born] = {}
-    before: list[dict[str, Any]] = []
-    for row in generations_of(rows):
-        for place, team in enumerate(row["teams"]):
-            if team["id"] in found:
-                continue
-            parents = set(_flat(team.get("parents", [])))
-            if not parents and team["origin"] in ("parent", "elite") and place < len(before):
-                parents = {before[place]["id"]}
-            fitness = team.get("fitness")
-            found[team["id"]] = Born(
-                int(row.get("generation", 0)),
-                float("nan") if fitness is None else float(fitness),
-                kind_of(team),
-                tuple(sorted(parents)),
-            )
-        before = row["teams"]
-    return found
+
+    def __init__(self, rows: Sequence[dict[str, Any]]) -> None:
+        self.rows = [row for row in rows if isinstance(row.get("teams"), list) and row["teams"]]
+        self._first: dict[int, tuple[int, int]] = {}  # row and place where it first is
+        for number, row in enumerate(self.rows):
+            for place, team in enumerate(row["teams"]):
+                if team["id"] not in self._first:
+                    self._first[team["id"]] = number, place
+        self.ids: Collection[int] = self._first.keys()
+
+    def born(self, this: int) -> Born:
+        """How a team came about.
+
+        A parent that mutation changed keeps its place, so that the team there before is its parent.
+        """
+        number, place = self._first[this]
+        row, before = self.rows[number], self.rows[number - 1]["teams"] if number else []
+        team = row["teams"][place]
+        parents = set(_flat(team.get("parents", [])))
+        if not parents and team["origin"] in ("parent", "elite") and place < len(before):
+            parents = {before[place]["id"]}
+        fitness = team.get("fitness")
+        return Born(
+            int(row.get("generation", 0)),
+            float("nan") if fitness is None else float(fitness),
+            kind_of(team),
+            tuple(sorted(parents)),
+        )
 
 
 def kind_of(team: dict[str, Any]) -> int:
@@ -62,64 +70,58 @@ def kind_of(team: dict[str, Any]) -> int:
     return KINDS.index(named.get(origin, "mutation" if mutated else "unchanged"))
 
 
-def fitness_of_teams(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
+def fitness_of_teams(story: Story) -> dict[str, list[Any]]:
     """Fitness of every team of some generations, evenly chosen, and how each team came about.
 
     Returns:
         ``generation`` ``[G]``, ``fitness`` and ``kind`` ``[G][P]``: a team that lives on keeps the
         kind of its birth.
     """
-    told, born = generations_of(rows), births(rows)
-    step = max(1, -(-len(told) // MOST_GENERATIONS))
-    kept = told[::-1][::step][::-1]  # the last one is among them
+    step = max(1, -(-len(story.rows) // MOST_GENERATIONS))
+    kept = story.rows[::-1][::step][::-1]  # the last one is among them
     return {
         "generation": [row.get("generation", 0) for row in kept],
         "fitness": [[team.get("fitness") for team in row["teams"]] for row in kept],
-        "kind": [[born[team["id"]].kind for team in row["teams"]] for row in kept],
+        "kind": [[story.born(team["id"]).kind for team in row["teams"]] for row in kept],
     }
 
 
-def ancestry(rows: Sequence[dict[str, Any]]) -> dict[str, list[Any]]:
+def ancestry(story: Story) -> dict[str, list[Any]]:
     """The teams of the last generation and all that they come from, youngest first.
 
     Returns:
         ``id``, ``generation`` of birth, ``fitness`` when first measured, ``kind`` and ``parents``
         (ids) of at most `MOST_ANCESTORS` teams; ``cut``: whether there are more.
     """
-    told = generations_of(rows)
     names = ("id", "generation", "fitness", "kind", "parents", "cut")
     out: dict[str, list[Any]] = {name: [] for name in names}
-    if not told:
+    if not story.rows:
         return out
-    born = births(rows)
-    todo = [team["id"] for team in told[-1]["teams"]]
+    todo = {team["id"]: story.born(team["id"]) for team in story.rows[-1]["teams"]}
     seen = set(todo)
     while todo and len(out["id"]) < MOST_ANCESTORS:
-        todo.sort(key=lambda team: born[team].generation)
-        this = todo.pop()
-        birth = born[this]
+        this = max(todo, key=lambda team: todo[team].generation)
+        birth = todo.pop(this)
         for name, value in zip(names, (this, *birth), strict=False):
             out[name].append(list(value) if isinstance(value, tuple) else value)
-        fresh = [p for p in birth.parents if p in born and p not in seen]
+        fresh = [p for p in birth.parents if p in story.ids and p not in seen]
         seen.update(fresh)
-        todo += fresh
+        todo |= {parent: story.born(parent) for parent in fresh}
     out["cut"] = [bool(todo)]
     return out
 
 
-def winners(rows: Sequence[dict[str, Any]]) -> list[int]:
+def winners(story: Story) -> list[int]:
     """How many teams of each of `KINDS` were the fittest of a generation, each team once."""
-    born, counts = births(rows), [0] * len(KINDS)
-    best = {
-        max(row["teams"], key=lambda team: _or_least(team.get("fitness")))["id"]
-        for row in generations_of(rows)
-    }
+    counts = [0] * len(KINDS)
+    best = {max(row["teams"], key=_fitness)["id"] for row in story.rows}
     for team in best:
-        counts[born[team].kind] += 1
+        counts[story.born(team).kind] += 1
     return counts
 
 
-def _or_least(value: Any) -> float:
+def _fitness(team: dict[str, Any]) -> float:
+    value = team.get("fitness")
     return float("-inf") if value is None else float(value)
 
 

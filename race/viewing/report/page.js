@@ -128,7 +128,7 @@
   function evolved() { return data.runs.filter((run) => run.population && shown(run)); }
   function runList() {
     const list = evolved(), before = kept.run;
-    $("run").replaceChildren(...list.map((run) => new Option(`${run.task}, ${run.method}, seed ${run.seed}`, run.name)));
+    $("run").replaceChildren(...list.map((run) => new Option(label(run), run.name)));
     if (list.some((run) => run.name === before)) $("run").value = before;
   }
   const HIDDEN = { showlegend: false, hoverinfo: "skip" };
@@ -136,6 +136,7 @@
     clear($("evolution"));
     const run = evolved().find((r) => r.name === $("run").value), place = $("evolution");
     $("no-evolution").textContent = run ? (run.teams ? "" : "Archives keep no lineage: of this run there are rates alone.") : "No run with a population is chosen.";
+    $("of-distances").hidden = true;
     if (!run) return;
     if (run.teams) {
       const { generation, fitness, kind } = run.teams;
@@ -159,6 +160,7 @@
       const won = data.kinds.map((name, k) => [name, run.winners[k], KIND_COLOURS[k]]).filter((w) => w[1]);
       chart(place, [{ type: "bar", x: won.map((w) => w[0].replace(" and ", "<br>and ")), y: won.map((w) => w[1]), marker: { color: won.map((w) => w[2]) } }], layout("Teams that were the fittest of a generation", "", "teams", { showlegend: false }));
     }
+    distances(run.distances, place);
     const lines = (title, keys) => {
       const traces = keys.filter(([key]) => run.training[key]).map(([key, name, hue]) => ({ x: run.training[$("axis").value], y: run.training[key], mode: "lines", name, line: { color: hue, width: 2 } }));
       if (traces.length) chart(place, traces, layout(title, xName(), "share, over the run so far", { yaxis: { range: [0, 1], gridcolor: "rgba(128,128,128,.25)", automargin: true } }));
@@ -168,9 +170,53 @@
     draw();
   }
 
+  function distances(found, place) {
+    if (!found) return;
+    $("of-distances").hidden = false;
+    const { teams, matrix, steps, mean, to_marl } = found, names = teams.map((name) => name.replace(" (elite)", "*")), many = teams.length > 12;
+    chart(place, [{ type: "heatmap", x: names, y: names, z: matrix, zmin: 0, zmax: 1.5, colorscale: "Viridis", text: teams.map((a) => teams.map((b) => `${a}, ${b}`)), texttemplate: many ? "" : "%{z:.2f}", hovertemplate: "%{text}<br>distance %{z}<extra></extra>", colorbar: { thickness: 10, outlinewidth: 0 } }],
+      layout(`Distances between teams at step ${steps[steps.length - 1].toLocaleString("en")} (*: elite)`, "", "by weights", { xaxis: { type: "category", tickangle: -40, automargin: true }, yaxis: { type: "category", autorange: "reversed", automargin: true } }));
+    if (steps.length > 1) {
+      const traces = [[mean, "mean over pairs of teams", KIND_COLOURS[2]], [to_marl, "MARL team to elite", KIND_COLOURS[5]]].filter(([y]) => y.some((value) => value !== null));
+      chart(place, traces.map(([y, name, hue]) => ({ x: steps, y, name, mode: "lines+markers", line: { color: hue } })), layout("Distances in the checkpoints that were kept", "environment steps", "distance", { yaxis: { rangemode: "tozero", gridcolor: "rgba(128,128,128,.25)", automargin: true } }));
+    }
+  }
+
+  const label = (run) => `${run.task}, ${run.method}, seed ${run.seed}`;
+  let fought = null; // the battle that is shown
+  function battleList() {
+    const list = data.runs.filter((run) => run.battle && shown(run)), before = kept.battle;
+    $("battle").replaceChildren(...list.map((run) => new Option(label(run), run.name)));
+    if (list.some((run) => run.name === before)) $("battle").value = before;
+  }
+  async function battle() {
+    const run = data.runs.find((r) => r.battle && shown(r) && r.name === $("battle").value);
+    if (fought && fought.name === (run && run.name)) { if (fought.player) fought.player.paint(); return; }
+    if (fought && fought.player) fought.player.stop();
+    $("fought").replaceChildren();
+    const mine = fought = run ? { name: run.name, player: null } : null;
+    if (!run) { $("fought").append(Object.assign(document.createElement("p"), { className: "note", textContent: "No battle of the runs that are chosen." })); return; }
+    const box = document.createElement("div"), player = await battlePlayer.show(box, run.battle.packed, run.battle.who);
+    if (fought !== mine) return; // another was chosen meanwhile
+    $("fought").append(box); mine.player = player; player.paint();
+  }
+
+  const films = new Map(); // kept when filters change, so that they play on
+  function film(run) {
+    if (!films.has(run.name)) {
+      const figure = document.createElement("figure"), video = document.createElement("video"), words = document.createElement("figcaption");
+      const bytes = Uint8Array.from(atob(run.video.data), (c) => c.charCodeAt(0));
+      Object.assign(video, { controls: true, muted: true, loop: true, preload: "metadata", src: URL.createObjectURL(new Blob([bytes], { type: "video/mp4" })) });
+      video.setAttribute("playsinline", "");
+      words.textContent = `${label(run)}: ${run.video.told}`; figure.append(video, words); films.set(run.name, figure);
+    }
+    return films.get(run.name);
+  }
+  function videos() { $("videos").replaceChildren(...data.runs.filter((run) => run.video && shown(run)).map(film)); }
+
   function drawAll() {
     document.querySelectorAll(".swatch").forEach((s) => { s.style.background = colour(s.dataset.method); });
-    curves(); losses(); runList(); evolution();
+    curves(); losses(); runList(); evolution(); battleList(); battle(); videos();
     document.body.dataset.drawn = String(Number(document.body.dataset.drawn || 0) + 1);
   }
 
@@ -201,6 +247,11 @@
   if (kept.axis) $("axis").value = kept.axis;
   choices("training", unique(data.runs.flatMap((run) => Object.keys(run.training))).filter((k) => k.includes("/")).sort((a, b) => order(a) - order(b)), (k) => k, losses);
   $("run").addEventListener("change", () => { keep("run", $("run").value); evolution(); });
+  $("battle").addEventListener("change", () => { keep("battle", $("battle").value); battle(); });
+  $("battle-part").hidden = !data.runs.some((run) => run.battle);
+  $("video-part").hidden = !data.runs.some((run) => run.video);
+  addEventListener("resize", () => { if (fought && fought.player) fought.player.paint(); });
+  for (const line of data.not_made) $("not-made").append(Object.assign(document.createElement("li"), { textContent: line }));
   $("filters").addEventListener("submit", (event) => event.preventDefault());
   for (const line of data.remarks) $("remarks").append(Object.assign(document.createElement("li"), { textContent: line }));
   for (const t of data.tables) table($("tables"), t.columns, t.rows, t.title, t.note);

@@ -14,7 +14,7 @@ from race.viewing.report.content import as_text
 # own server whether there is something new.
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "img-src data: blob:; connect-src {connect}"
+    "img-src data: blob:; media-src blob:; connect-src {connect}"
 )
 
 
@@ -41,6 +41,7 @@ def page_of(content: Any, *, title: str, watched: str = "") -> str:
             f'<body data-watched="{html.escape(watched)}">{_asset("page.html")}',
             f'<script type="application/json" id="content">{as_text(content)}</script>',
             f'<script type="text/plain" id="plotly">{_plotly()}</script>',
+            f"<script>{_asset('page.battles.js')}</script>",
             f"<script>{_asset('page.js')}</script></body></html>\n",
         ]
     ).replace("TITLE_OF_THE_PAGE", html.escape(title))
