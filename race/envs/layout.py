@@ -53,7 +53,9 @@ def layout(task_id: str, task: AnyTask) -> Layout:
             state, moved = _of_robot(env)
         elif task_id.startswith(jaxmarl.PREFIX) and env.names is not None:
             shown, *each = env.names
-            return Layout(tuple(env.team), tuple(shown), *(tuple(map(tuple, one)) for one in each))
+            return Layout(
+                tuple(env.team_names), tuple(shown), *(tuple(map(tuple, one)) for one in each)
+            )
         else:
             state, moved = _flattened(env), []
     finally:

@@ -22,8 +22,8 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
     ``key, now = jax.random.split(key)``.
 
     Attributes:
-        team: names of the team's agents.
-        paid: what each of them was paid in the newest step.
+        team_names: names of the team's agents.
+        team_paid: what each of them was paid in the newest step.
         names: of the entries of the state, and of each agent's observation and actions, if known.
     """
 
@@ -41,7 +41,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
                 f"{spec.task} cannot be rendered here: JaxMARL's own visualizers draw its states."
             )
         n, shape = spec.n_agents, (spec.n_agents, spec.obs_size)
-        self.team, self.paid = adapter.team, [0.0] * n
+        self.team_names, self.team_paid = adapter.team, [0.0] * n
         self.observation_space = spaces.Dict(
             {
                 "obs": spaces.Box(-np.inf, np.inf, shape, np.float32),
@@ -79,7 +79,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         actions = np.asarray(action).astype(np.int32)
         now = self._next_key()
         self._state, seen, outcome, paid = _step(self._adapter, self._state, actions, now)
-        self.paid = np.asarray(paid).tolist()
+        self.team_paid = np.asarray(paid).tolist()
         ends = bool(outcome.terminated), bool(outcome.truncated)
         return _as_dict(seen), float(outcome.reward), *ends, {"battle_won": bool(outcome.won)}
 

@@ -39,12 +39,12 @@ class Paying(Protocol):
     action_space: Any
 
     @property
-    def team(self) -> Any:
+    def team_names(self) -> Any:
         """Names of the team's agents."""
         ...
 
     @property
-    def paid(self) -> Any:
+    def team_paid(self) -> Any:
         """What each of them was paid in the newest step."""
         ...
 
@@ -62,13 +62,13 @@ def look(env: CheckedEnv) -> Conflict | None:
         HandedOverError: if what it shows breaks the contract.
     """
     team = env.env
-    if not isinstance(team, Paying) or len(team.team) < 2:
+    if not isinstance(team, Paying) or len(team.team_names) < 2:
         return None
     found = opposed(_rewards(env, team))
     if found is None:
         return None
     one, other, correlation = found
-    return Conflict(str(team.team[one]), str(team.team[other]), correlation)
+    return Conflict(str(team.team_names[one]), str(team.team_names[other]), correlation)
 
 
 def opposed(rewards: Float[np.ndarray, "steps N"]) -> tuple[int, int, float] | None:
@@ -106,5 +106,5 @@ def _rewards(env: CheckedEnv, team: Paying) -> Float[np.ndarray, "steps N"]:
                 rows = seen.avail_actions
                 step = env.step(np.array([random.choice(np.flatnonzero(row)) for row in rows]))
             seen, over = step.seen, step.terminated or step.truncated
-            found.append(list(team.paid))
-    return np.array(found).reshape(len(found), len(team.team))
+            found.append(list(team.team_paid))
+    return np.array(found).reshape(len(found), len(team.team_names))

@@ -104,12 +104,12 @@ class TeamEnv(gymnasium.Env[Any, Any]):
         )
 
     @property
-    def team(self) -> list[Any]:
+    def team_names(self) -> list[Any]:
         """Names of the team's agents."""
         return self.parallel.team
 
     @property
-    def paid(self) -> list[float]:
+    def team_paid(self) -> list[float]:
         """What each of them was paid in the newest step."""
         return list(self.parallel.rewards)
 
