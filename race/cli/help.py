@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, NamedTuple, Union, get_args, 
 
 import tyro
 
-from race.config.effects import idle
+from race.config.effects import Facts, idle
 from race.config.presets import PRESETS
 from race.config.settings import Config
 
@@ -118,14 +118,14 @@ def _idle(asked: Any) -> frozenset[str]:
         on_host = not isinstance(made, DiscreteTask) or made.device is None
     names = {field.name for field in dataclasses.fields(Config)}
     config = Config(**{name: getattr(asked, name) for name in names if hasattr(asked, name)})
-    return idle(
-        config,
+    facts = Facts(
         discrete=discrete,
         reads_env=reads_config(task),
         on_host=on_host,
         reads_parallel=reads_team(task),
         reads_game=reads_game(task),
     )
+    return idle(config, facts)
 
 
 def options_of(group: Any, prefix: str = "", asked: Any = None) -> Iterator[Option]:

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from race.config.hyper import NUMBERS_OF_EVOLUTIONS
 from race.config.settings import Config, EnvConfig, FacmacConfig, LearnerConfig, RaceConfig
@@ -37,39 +37,34 @@ _OF_EVOLUTIONS = {
 }
 
 
-def refuse_without_effect(
-    asked: Config,
-    defaults: LearnerConfig,
-    *,
-    discrete: bool,
-    reads_env: bool,
-    on_host: bool,
-    reads_parallel: bool = False,
-    reads_game: bool = False,
-) -> None:
+class Facts(NamedTuple):
+    """What a task is, as far as settings have effects because of it."""
+
+    discrete: bool
+    """Whether its actions are."""
+    reads_env: bool
+    """Whether it reads what its agents observe."""
+    on_host: bool
+    """Whether its environments run on the host."""
+    reads_parallel: bool = False
+    """Whether it reads who the team of an environment of PettingZoo or JaxMARL is."""
+    reads_game: bool = False
+    """Whether it reads which interpreter plays StarCraft II."""
+
+
+def refuse_without_effect(asked: Config, defaults: LearnerConfig, task: Facts) -> None:
     """Refuses settings that nothing would read.
 
     Args:
         asked: what was asked for, before presets are filled in.
         defaults: the learner settings of the preset.
-        discrete: whether the task's actions are.
-        reads_env: whether the task reads what its agents observe.
-        on_host: whether its environments run on the host.
-        reads_parallel: whether the task reads who the team of a PettingZoo environment is.
-        reads_game: whether it reads which interpreter plays StarCraft II.
+        task: what the task is.
 
     Raises:
         ConfigError: naming the settings, and why they would have no effect.
     """
     told: dict[str, list[str]] = {}
-    facts = {
-        "discrete": discrete,
-        "reads_env": reads_env,
-        "on_host": on_host,
-        "reads_parallel": reads_parallel,
-        "reads_game": reads_game,
-    }
-    for name, why in without_effect(asked, defaults, **facts).items():
+    for name, why in without_effect(asked, defaults, task).items():
         told.setdefault(why, []).append(f"--{name.replace('_', '-')}")
     if told:
         sentences = [
@@ -78,21 +73,10 @@ def refuse_without_effect(
         raise ConfigError(f"{' '.join(sentences)} Leave out what has no effect.")
 
 
-def without_effect(
-    asked: Config,
-    defaults: LearnerConfig,
-    *,
-    discrete: bool,
-    reads_env: bool,
-    on_host: bool,
-    reads_parallel: bool = False,
-    reads_game: bool = False,
-) -> dict[str, str]:
+def without_effect(asked: Config, defaults: LearnerConfig, task: Facts) -> dict[str, str]:
     """The settings that are not what they usually are, though nothing would read them; and why."""
     found: dict[str, str] = {}
-    facts = {"discrete": discrete, "reads_env": reads_env, "on_host": on_host}
-    told = {"reads_parallel": reads_parallel, "reads_game": reads_game}
-    for name, why in _idle(asked, **facts, **told):
+    for name, why in _idle(asked, task):
         if name not in found and setting(asked, name) != usual(name, defaults):
             found[name] = why
     return found
@@ -110,12 +94,9 @@ def usual(name: str, defaults: LearnerConfig) -> Any:
     return getattr(defaults if group == "learner" else _DEFAULTS[group], field)
 
 
-def idle(asked: Config, **facts: bool) -> frozenset[str]:
-    """The names of settings that nothing would read, such as ``learner.policy_delay``.
-
-    Arguments are those of `refuse_without_effect`.
-    """
-    return frozenset(name for name, _ in _idle(asked, **facts))
+def idle(asked: Config, task: Facts) -> frozenset[str]:
+    """The names of settings that nothing would read, such as ``learner.policy_delay``."""
+    return frozenset(name for name, _ in _idle(asked, task))
 
 
 _DEFAULTS: dict[str, Any] = {
@@ -126,33 +107,25 @@ _DEFAULTS: dict[str, Any] = {
 }
 
 
-def _idle(
-    asked: Config,
-    *,
-    discrete: bool,
-    reads_env: bool,
-    on_host: bool,
-    reads_parallel: bool,
-    reads_game: bool,
-) -> Iterator[tuple[str, str]]:
+def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
     yield from _idle_of_population(asked)
-    yield from _idle_of_learner(asked, discrete)
-    if not reads_env:
+    yield from _idle_of_learner(asked, task.discrete)
+    if not task.reads_env:
         why = f"on {asked.task}, whose agents observe what they do in any case"
         yield from ((f"env.{name}", why) for name in (*_OBSERVATION, "library_observation"))
     elif asked.env.library_observation:
         why = "with --env.library-observation, which chooses for itself"
         yield from ((f"env.{name}", why) for name in _OBSERVATION)
-    if not reads_parallel:
+    if not task.reads_parallel:
         why = f"on {asked.task}, which is no PettingZoo or JaxMARL task"
         yield from ((f"env.{name}", why) for name in _PARALLEL)
-    if not reads_game:
+    if not task.reads_game:
         yield "env.python", f"on {asked.task}, which is no game of StarCraft II"
-    if not (reads_parallel or reads_game):
+    if not (task.reads_parallel or task.reads_game):
         why = f"on {asked.task}, whose environment takes no arguments"
         yield "env.kwargs", why
-    if not on_host:
+    if not task.on_host:
         why = f"on {asked.task}, which runs in one compiled program"
         yield from ((f"env.{name}", why) for name in _HOST)
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from race.algorithms.evolutions import evolution_of
 from race.config.ablations import ablated
-from race.config.effects import refuse_without_effect, setting, usual, without_effect
+from race.config.effects import Facts, refuse_without_effect, setting, usual, without_effect
 from race.config.files import Wanted, with_settings
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config
@@ -24,15 +24,15 @@ def settled(asked: Config, preset: str, ablation: tuple[str, ...], task: AnyTask
         ConfigError: if something is wrong, has no effect, or does not go together.
     """
     facts = _facts(asked, task)
-    asked = ablated(asked, ablation, facts["discrete"])
-    if facts["discrete"] and preset != "paper":
+    asked = ablated(asked, ablation, facts.discrete)
+    if facts.discrete and preset != "paper":
         raise ConfigError(
             f"--preset {preset} has no effect on {asked.task}: its actions are discrete, and the "
             "presets are of learners of continuous actions. Leave it out; --facmac.* are the "
             "settings of the learner on this task."
         )
-    refuse_without_effect(asked, PRESETS[preset], **facts)
-    config = resolve(asked, discrete=facts["discrete"])
+    refuse_without_effect(asked, PRESETS[preset], facts)
+    config = resolve(asked, discrete=facts.discrete)
     evolution_of(config.race.evolution)  # an operator that is not there is told of at once
     return config
 
@@ -53,7 +53,7 @@ def without_idle(
     Returns:
         The configuration, and the names of what was left out.
     """
-    idle = without_effect(asked, PRESETS[preset], **_facts(asked, task))
+    idle = without_effect(asked, PRESETS[preset], _facts(asked, task))
     dropped = [name for name in idle if name in given and setting(asked, name) == given[name]]
     changed = {name: usual(name, PRESETS[preset]) for name in dropped}
     return with_settings(asked, changed), dropped
@@ -86,14 +86,14 @@ def settled_with_file(
     return settled(asked, preset, ablation, task)
 
 
-def _facts(asked: Config, task: AnyTask) -> dict[str, bool]:
-    return {
-        "discrete": isinstance(task, DiscreteTask),
-        "reads_env": reads_config(asked.task),
-        "on_host": not isinstance(task, DiscreteTask) or task.device is None,
-        "reads_parallel": reads_team(asked.task),
-        "reads_game": reads_game(asked.task),
-    }
+def _facts(asked: Config, task: AnyTask) -> Facts:
+    return Facts(
+        discrete=isinstance(task, DiscreteTask),
+        reads_env=reads_config(asked.task),
+        on_host=not isinstance(task, DiscreteTask) or task.device is None,
+        reads_parallel=reads_team(asked.task),
+        reads_game=reads_game(asked.task),
+    )
 
 
 def is_tried(task_id: str) -> bool:

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from race.config.effects import refuse_without_effect
+from race.config.effects import Facts, refuse_without_effect
 from race.config.hyper import hyper_of
 from race.config.presets import PRESETS, resolve
 from race.config.settings import Config, EnvConfig, FacmacConfig, LearnerConfig, RaceConfig
@@ -56,7 +56,7 @@ def other(name: str, value: Any) -> Any:
 def refused(config: Config, **facts: bool) -> str:
     defaults = {"discrete": False, "reads_env": True, "on_host": True}
     try:
-        refuse_without_effect(config, PRESETS["paper"], **(defaults | facts))
+        refuse_without_effect(config, PRESETS["paper"], Facts(**(defaults | facts)))
     except ConfigError as error:
         return str(error)
     return ""
@@ -135,4 +135,5 @@ def test_a_base_beside_another_algorithm_is_refused() -> None:
 
 def test_presets_are_no_wish_of_the_users() -> None:
     config = Config("some-task", algo="maddpg", learner=PRESETS["td3"])
-    refuse_without_effect(config, PRESETS["td3"], discrete=False, reads_env=True, on_host=True)
+    task = Facts(discrete=False, reads_env=True, on_host=True)
+    refuse_without_effect(config, PRESETS["td3"], task)
