@@ -11,6 +11,7 @@ import math
 import os
 import re
 import shutil
+import socket
 import tempfile
 import time
 import warnings
@@ -301,14 +302,18 @@ def _join(ray: Any, grpc: Any, on: str) -> None:
 
 def _await_answer(grpc: Any, address: str, on: str) -> None:
     """Ray itself would try for a minute."""
+    host, _, port = address.rpartition(":")
     channel = grpc.insecure_channel(address)
     try:
+        with socket.create_connection((host, int(port)), timeout=ANSWER_WITHIN):
+            pass  # what refuses is heard of at once
         grpc.channel_ready_future(channel).result(timeout=ANSWER_WITHIN)
-    except grpc.FutureTimeoutError as error:
+    except (OSError, grpc.FutureTimeoutError) as error:
+        why = str(error) or "what listens there speaks another language, or does not answer"
         raise RaceError(
-            f"No Ray cluster answers at {on} within {ANSWER_WITHIN:.0f} seconds. See that it runs "
-            "(`ray start --head --ray-client-server-port=10001` on its first machine), that this "
-            "machine may reach it, and that the port is that for clients."
+            f"No Ray cluster answers at {on} ({why}). See that it runs (`ray start --head "
+            "--ray-client-server-port=10001` on its first machine), that this machine may reach "
+            "it, and that the port is that for clients."
         ) from error
     finally:
         channel.close()

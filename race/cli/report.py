@@ -1,8 +1,6 @@
 """``race report``."""
 
-import contextlib
 import gc
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, final
@@ -81,18 +79,25 @@ def main(arguments: list[str]) -> None:
         maker = Maker(replays, chosen.videos, telling.tell)
 
         def make(watched: str = "") -> str:
-            gc.unfreeze()  # of the page before
-            telling.tell("reading runs", 0, 1)
-            with _no_collection():
+            # Rows are millions of small objects that all stay: looking among them for garbage
+            # takes as long again, also once they are there.
+            gc.disable()
+            try:
+                telling.tell("reading runs", 0, 1)
                 runs = load(chosen.runs)
-            made = maker.made_of(runs)
-            telling.tell("making the page", 0, 1)
-            with _no_collection():
+                gc.freeze()
+                gc.enable()
+                made = maker.made_of(runs)
+                gc.disable()
+                telling.tell("making the page", 0, 1)
                 content = content_of(runs, chosen.metric, chosen.team, chosen.base, made)
-            telling.nothing()
-            for remark in content["not_made"] if not watched else ():
-                console.print(remark, soft_wrap=True)
-            return page_of(content, title=chosen.title, watched=watched)
+                telling.nothing()
+                for remark in content["not_made"] if not watched else ():
+                    console.print(remark, soft_wrap=True)
+                return page_of(content, title=chosen.title, watched=watched)
+            finally:
+                gc.enable()
+                gc.unfreeze()
 
         if chosen.watch:
             with server(list(chosen.runs), make, chosen.port) as serving:
@@ -107,17 +112,6 @@ def main(arguments: list[str]) -> None:
     with written_aside(chosen.out) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"Page: {chosen.out} ({chosen.out.stat().st_size / 1e6:.1f} MB)")
-
-
-@contextlib.contextmanager
-def _no_collection() -> Iterator[None]:
-    """Rows are millions of small objects that all stay: looking for garbage takes as long again."""
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.freeze()  # what is there now is not looked through later either
-        gc.enable()
 
 
 @final

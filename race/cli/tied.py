@@ -20,6 +20,9 @@ def main(words: Sequence[str]) -> None:
         ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
     if os.getppid() != int(parent):
         sys.exit(1)
+    # Ray keeps Ctrl-C from its processes, and that would be inherited: this one is to hear of it.
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
     os.execv(command[0], command)
 
 

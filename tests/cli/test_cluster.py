@@ -144,6 +144,23 @@ def test_a_process_ends_with_the_one_that_it_is_tied_to(tmp_path: Path) -> None:
     assert time.monotonic() < deadline
 
 
+def test_a_process_that_is_tied_hears_of_interrupts_again() -> None:
+    signals = "signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})"
+    said = "import signal; print(signal.getsignal(2).__name__, signal.pthread_sigmask(0, []))"
+    words = f"['-m', 'race.cli.tied', str(os.getpid()), sys.executable, '-c', {said!r}]"
+    done = subprocess.run(
+        [
+            *(sys.executable, "-c"),
+            f"import os, signal, subprocess, sys; {signals}; signal.signal(2, signal.SIG_IGN); "
+            f"subprocess.run([sys.executable, *{words}], check=True)",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert done.stdout == "default_int_handler set()\n"
+
+
 def state_of(process: int) -> str:
     try:
         return Path(f"/proc/{process}/status").read_text()
