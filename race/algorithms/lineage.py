@@ -150,7 +150,7 @@ def rows(lineage: Lineage, fitness: tuple[float, ...]) -> list[dict[str, Any]]:
     mixed = np.any(columns.share > 0, axis=1).tolist()
     mutated = np.any(columns.changes > 0, axis=(1, 2)).tolist()
     share = np.round(columns.share.astype(np.float64), 4).tolist()
-    host = Lineage(*(column.tolist() for column in columns))
+    host: Any = Lineage(*(column.tolist() for column in columns))  # type: ignore[arg-type]
     found = []
     for place, value in enumerate(fitness):
         team: dict[str, Any] = {

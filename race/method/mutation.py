@@ -43,7 +43,7 @@ def smallest(lots: Float[Array, "i o"], count: Int[Array, "o"]) -> Bool[Array, "
     bound = jax.lax.fori_loop(0, STEPS, narrow, jnp.zeros(count.shape, jnp.int32))
     equal, place = whole == bound[:, None], jnp.arange(whole.shape[1])[None]
 
-    # Hardly ever are there too many, and a cumulative sum takes as long as the bisection.
+    # Hardly ever are there too many, and a cumulative sum takes longer than the bisection.
     def drop_last(surplus: tuple[Any, Any]) -> tuple[Any, Any]:
         too_many, end = surplus
         last = jnp.max(jnp.where(equal & (place < end[:, None]), place, -1), axis=1)
