@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from race.algorithms.population import Population
 from race.method.normalisation import Scaling
+from race.types import Team
 
 Losses = dict[str, Float[Array, ""]]
 
@@ -59,12 +60,14 @@ class Algorithm(NamedTuple):
     """(state, spec) -> the MARL team (``marl``), if there is one, and the team of best training
     fitness (``champion``), if there is a population."""
     evolve: Callable[..., Any]
-    """(state, fitness [P], key, spec, shape, hyper) -> state; lines 9 of Algorithm 1."""
+    """(state, fitness [P], key, spec, shape, hyper) -> state; line 9 of Algorithm 1. It looks at
+    the population alone."""
     update: Callable[..., tuple[Any, Losses, Losses]]
     """(state, batch, step, key, spec, shape, hyper) -> state, critic losses, policy losses; lines
     8, 10 and 13. Policy losses are zero on steps where the policy delay idles."""
-    inject: Callable[..., Any]
-    """(state, key, shape, hyper) -> state; line 11."""
+    entrant: Callable[..., Team] | None
+    """(state, shape) -> the MARL team as it enters the population in line 11; None unless there
+    are both."""
     population: Callable[[Any], Population | None]
     """state -> the population, if there is one."""
     critic_losses: tuple[str, ...]

@@ -66,17 +66,13 @@ def _update(
     return state, {}, {}
 
 
-def _inject(state: EaState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> EaState:
-    return state
-
-
 ea = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
     evolve=evolve_state,
     update=_update,
-    inject=_inject,
+    entrant=None,
     population=population_of,
     critic_losses=(),
     policy_losses=(),

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from race.method.crossover import Bred
@@ -143,7 +144,13 @@ def rows(lineage: Lineage, fitness: tuple[float, ...]) -> list[dict[str, Any]]:
     second gave; ``changes`` the numbers of each agent's weights that changed strongly, were drawn
     anew and changed mildly.
     """
-    host = Lineage(*(column.tolist() for column in jax.device_get(lineage)))
+    columns: Lineage = jax.device_get(lineage)
+    first, second = columns.first, columns.second
+    alike = np.all((first == first[:, :1]) & (second == second[:, :1]), axis=1).tolist()
+    mixed = np.any(columns.share > 0, axis=1).tolist()
+    mutated = np.any(columns.changes > 0, axis=(1, 2)).tolist()
+    share = np.round(columns.share.astype(np.float64), 4).tolist()
+    host: Any = Lineage(*(column.tolist() for column in columns))  # type: ignore[arg-type]
     found = []
     for place, value in enumerate(fitness):
         team: dict[str, Any] = {
@@ -151,13 +158,13 @@ def rows(lineage: Lineage, fitness: tuple[float, ...]) -> list[dict[str, Any]]:
             "fitness": value,
             "origin": ORIGINS[host.origin[place]],
         }
-        pairs = list(zip(host.first[place], host.second[place], strict=True))
         if host.origin[place] in (COPY, OFFSPRING):
+            pairs = zip(host.first[place], host.second[place], strict=True)
             parents = [[a] if a == b else [a, b] for a, b in pairs]
-            team["parents"] = parents[0] if all(p == parents[0] for p in parents) else parents
-        if any(host.share[place]):
-            team["from_second"] = [round(share, 4) for share in host.share[place]]
-        if any(map(any, host.changes[place])):
+            team["parents"] = parents[0] if alike[place] else parents
+        if mixed[place]:
+            team["from_second"] = share[place]
+        if mutated[place]:
             team["changes"] = host.changes[place]
         found.append(team)
     return found

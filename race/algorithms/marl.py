@@ -128,10 +128,6 @@ def _evolve(
     return state
 
 
-def _inject(state: MarlState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> MarlState:
-    return state
-
-
 def _population(state: MarlState) -> None:
     return None
 
@@ -142,7 +138,7 @@ marl = Algorithm(
     tested=tested,
     evolve=_evolve,
     update=update,
-    inject=_inject,
+    entrant=None,
     population=_population,
     critic_losses=("critic",),
     policy_losses=("policy",),

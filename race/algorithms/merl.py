@@ -15,7 +15,7 @@ from race.algorithms.base import Algorithm, Losses, Teams, Tested
 from race.algorithms.ea import whole_teams
 from race.algorithms.evolutions import evolve_state
 from race.algorithms.marl import MarlState, heads_of, marl
-from race.algorithms.population import Population, inject_team, population_of
+from race.algorithms.population import Population, population_of
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
@@ -36,7 +36,8 @@ def init(key: PRNGKeyArray, spec: Spec, shape: Shape, hyper: Hyper) -> MerlState
     return MerlState(learned, whole_teams(population_key, spec, shape))
 
 
-def _marl_team(state: MerlState, shape: Shape) -> Team:
+def entrant(state: MerlState, shape: Shape) -> Team:
+    """The whole MARL team."""
     encoder = learner_of(shape).of_each_agent(state.marl.encoder.params)
     return Team(encoder, heads_of(state.marl, state.population.teams.heads.shape[1]))
 
@@ -46,7 +47,7 @@ def teams(state: MerlState, spec: Spec, shape: Shape) -> Teams:
     every: Team = jax.tree.map(
         lambda leaf, one: jnp.concatenate([leaf, one[None]]),
         state.population.teams,
-        _marl_team(state, shape),
+        entrant(state, shape),
     )
     return Teams(every.encoder, every.heads, own_encoders=True)
 
@@ -71,19 +72,13 @@ def update(
     return state._replace(marl=learned), critic, policy
 
 
-def inject_marl(state: MerlState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> MerlState:
-    """The whole MARL team replaces the team of lowest fitness."""
-    entered = inject_team(state.population, _marl_team(state, shape), key, hyper)
-    return state._replace(population=entered)
-
-
 merl = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
     evolve=evolve_state,
     update=update,
-    inject=inject_marl,
+    entrant=entrant,
     population=population_of,
     critic_losses=marl.critic_losses,
     policy_losses=marl.policy_losses,

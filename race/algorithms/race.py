@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from race.algorithms.base import Algorithm, Losses, Teams, Tested, when
 from race.algorithms.evolutions import evolve_state
 from race.algorithms.evolutions import start as start_population
-from race.algorithms.population import Population, inject_team, population_of
+from race.algorithms.population import Population, population_of
 from race.algorithms.race_update import (
     CRITIC_LOSSES,
     POLICY_LOSSES,
@@ -136,10 +136,9 @@ def update(
     return moved, critic_losses, policy_losses
 
 
-def inject_marl(state: RaceState, key: PRNGKeyArray, shape: Shape, hyper: Hyper) -> RaceState:
-    """Line 11."""
-    team = Team(None, _marl_team(state))
-    return state._replace(population=inject_team(state.population, team, key, hyper))
+def entrant(state: RaceState, shape: Shape) -> Team:
+    """Of line 11: the MARL team's heads."""
+    return Team(None, _marl_team(state))
 
 
 def tested(state: RaceState, spec: Spec) -> tuple[Tested, ...]:
@@ -154,7 +153,7 @@ race = Algorithm(
     tested=tested,
     evolve=evolve_state,
     update=update,
-    inject=inject_marl,
+    entrant=entrant,
     population=population_of,
     critic_losses=CRITIC_LOSSES,
     policy_losses=POLICY_LOSSES,

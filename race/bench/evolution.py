@@ -70,7 +70,11 @@ class Evolutions:
 
     def __call__(self) -> dict[str, Any]:
         """Selection, crossover, mutation, injection, lineage and statistics of a generation."""
-        programs_of = {"algorithm": self._algorithm, "shape": self._shape, "hyper": self._hyper}
+        programs_of: dict[str, Any] = {
+            "algorithm": self._algorithm,
+            "shape": self._shape,
+            "hyper": self._hyper,
+        }
         key, fitness = jax.random.key(1), jnp.asarray(self._fitness)
         state = programs.evolve(self.state, fitness, key, spec=self._spec, **programs_of)
         self.state = programs.inject(state, key, **programs_of)

@@ -5,7 +5,7 @@
 
 from collections import Counter
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.algorithms import Algorithm
 from race.algorithms.base import Losses, Teams
+from race.algorithms.population import Population, inject_team
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import LEARNERS
@@ -21,7 +22,7 @@ from race.method.normalisation import Scaling, scaled
 from race.networks.dense import act_teams
 from race.replay.buffer import Layout, Replay, distinct_places, insert, sample, slots_of
 from race.replay.shown import as_shown
-from race.types import EnvSpec, Spec
+from race.types import EnvSpec, Spec, Team
 
 TRACES: Counter[str] = Counter()
 """How often each program was traced in this process: one more than expected is a slow surprise."""
@@ -109,7 +110,6 @@ def draw(
     return places, replay.data.length[places]
 
 
-@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
 def evolve(
     state: Any,
     fitness: Float[Array, "P"],
@@ -120,18 +120,53 @@ def evolve(
     spec: Spec,
     shape: Shape,
 ) -> Any:
-    """One evolution of the population."""
-    TRACES["evolve"] += 1
-    return algorithm.evolve(state, fitness, key, spec, shape, hyper)
+    """One evolution of the population; the arrays of the old one are gone.
+
+    Only the population goes through the program: with all that learns, handing the arrays over
+    takes longer than the evolution.
+    """
+    population = OnlyPopulation(state.population)
+    evolved = _evolve(
+        population, fitness, key, hyper=hyper, algorithm=algorithm, spec=spec, shape=shape
+    )
+    return state._replace(population=evolved.population)
 
 
-@partial(jax.jit, static_argnames=("algorithm", "shape"), donate_argnames="state")
 def inject(
     state: Any, key: PRNGKeyArray, *, hyper: Hyper, algorithm: Algorithm, shape: Shape
 ) -> Any:
-    """The MARL team enters the population."""
+    """The MARL team enters the population; the arrays of the old one are gone."""
+    assert algorithm.entrant is not None
+    entrant = algorithm.entrant(state, shape)
+    return state._replace(population=_inject(state.population, entrant, key, hyper=hyper))
+
+
+class OnlyPopulation(NamedTuple):
+    """What of an algorithm's state evolves."""
+
+    population: Population
+
+
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
+def _evolve(
+    state: OnlyPopulation,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    *,
+    hyper: Hyper,
+    algorithm: Algorithm,
+    spec: Spec,
+    shape: Shape,
+) -> OnlyPopulation:
+    TRACES["evolve"] += 1
+    evolved: OnlyPopulation = algorithm.evolve(state, fitness, key, spec, shape, hyper)
+    return evolved
+
+
+@partial(jax.jit, donate_argnames="population")
+def _inject(population: Population, team: Team, key: PRNGKeyArray, *, hyper: Hyper) -> Population:
     TRACES["inject"] += 1
-    return algorithm.inject(state, key, shape, hyper)
+    return inject_team(population, team, key, hyper)
 
 
 @partial(jax.jit, donate_argnames="replay")

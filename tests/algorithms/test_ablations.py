@@ -30,6 +30,7 @@ from test_race_update import (
 from tiny_episodes import laid_out, random_batch, start, stepper, tiny_facmac
 
 from race.algorithms import race
+from race.algorithms.population import inject_team
 from race.config.ablations import ABLATIONS, ablated, told_by_name
 from race.config.hyper import Hyper, hyper_of
 from race.config.presets import resolve
@@ -187,7 +188,10 @@ def evolved(
     @jax.jit
     def generation(hyper: Hyper) -> Any:
         after = race.evolve(state, fitness, jax.random.key(1), tiny_spec, shape, hyper)
-        return race.inject(after, jax.random.key(2), shape, hyper)
+        entered = inject_team(
+            after.population, race.entrant(after, shape), jax.random.key(2), hyper
+        )
+        return after._replace(population=entered)
 
     def evolve(**changes: float) -> tuple[Any, Any]:
         numbers = {name: np.float32(value) for name, value in changes.items()}

@@ -12,6 +12,7 @@ import pytest
 from tiny_episodes import with_heads
 
 from race.algorithms import Algorithm, algorithm_of, ea, marl, merl, race
+from race.algorithms.population import inject_team
 from race.config.hyper import Hyper, hyper_of
 from race.config.settings import Config, LearnerConfig
 from race.config.shape import shape_of
@@ -61,7 +62,11 @@ class Case:
 
     def inject(self, state: Any) -> Any:
         shape, hyper = shape_of(self.config), hyper_of(self.config)
-        return self.algorithm.inject(state, jax.random.key(0), shape, hyper)
+        if self.algorithm.entrant is None:
+            return state
+        entrant = self.algorithm.entrant(state, shape)
+        entered = inject_team(state.population, entrant, jax.random.key(0), hyper)
+        return state._replace(population=entered)
 
     def heads(self, state: Any) -> Any:
         """Those of all teams."""

@@ -27,6 +27,7 @@ from tiny_episodes import (
 )
 
 from race.algorithms import race
+from race.algorithms.population import inject_team
 from race.config.hyper import hyper_of
 from race.config.settings import Config
 from race.config.shape import shape_of
@@ -171,7 +172,9 @@ def test_injection_gives_every_agent_of_the_worst_team_the_marl_head(
 ) -> None:
     roles = before.population._replace(worst=jnp.int32(2), elite=jnp.int32(0))
     state = before._replace(population=roles)
-    after = race.inject(state, jax.random.key(0), shape_of(config), hyper_of(config))
+    entrant = race.entrant(state, shape_of(config))
+    entered = inject_team(roles, entrant, jax.random.key(0), hyper_of(config))
+    after = state._replace(population=entered)
     assert int(after.population.injected) == 2
     for agent in range(N):
         assert jnp.array_equal(after.heads[2, agent], before.policies.head.params[0])

@@ -11,6 +11,7 @@ import pytest
 from race import programs
 from race.algorithms import algorithm_of, ea, marl, merl, race
 from race.algorithms.base import Teams
+from race.algorithms.population import inject_team
 from race.config.hyper import hyper_of
 from race.config.presets import resolve
 from race.config.settings import Config, FacmacConfig, RaceConfig
@@ -134,9 +135,9 @@ def test_merl_learns_as_the_learner_alone(
 def check_injection(config: Config, spec: Any) -> None:
     state = start(config, spec)
     roles = state.population._replace(worst=jnp.int32(2))
-    after = merl.inject(
-        state._replace(population=roles), jax.random.key(0), shape_of(config), hyper_of(config)
-    )
+    entrant = merl.entrant(state, shape_of(config))
+    entered = inject_team(roles, entrant, jax.random.key(0), hyper_of(config))
+    after = state._replace(population=entered)
     teams = merl.teams(state, spec, shape_of(config))
     last = teams.at(slice(teams.count - 1, None))
     entered = jax.tree.map(lambda leaf: leaf[2:3], after.population.teams)

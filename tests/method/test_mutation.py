@@ -59,6 +59,7 @@ def test_the_smallest_of_each_column_are_those_that_sorting_finds(values: int) -
     lots[:, :2] = [[0.0, 1 - 2.0**-23]]
     count = np.concatenate([[0, 300, 1, 299], rng.integers(0, 301, 36)])
     count[0] = 7
+    lots[5:9, 3], count[3] = 0.0, 0  # none, where the smallest possible is there
     picked = jax.jit(mutation.smallest)(jnp.asarray(lots), jnp.asarray(count, jnp.int32))
     place = np.argsort(np.argsort(lots, axis=0, kind="stable"), axis=0)
     np.testing.assert_array_equal(picked, place < count)

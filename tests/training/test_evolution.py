@@ -113,6 +113,6 @@ def test_race_climbs_above_chance(tmp_path: Path, capsys: pytest.CaptureFixture[
             run(path, resolve(config, discrete=True))
             last = rows(path, "evaluation")[-1]["eval/selected/return_mean"]
             counts[algo] += last == CLIMB_PAYOFFS[0][0]
-    with capsys.disabled():
-        print(f"\nprobe/climb, better optimum in 20 seeds: {counts}")
+        with capsys.disabled():
+            print(f"\nprobe/climb, better optimum in 20 seeds: {algo} {counts[algo]}")
     assert counts["race"] > binom.ppf(0.99, len(SEEDS), 1 / 9)
