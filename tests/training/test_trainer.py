@@ -196,7 +196,7 @@ def test_the_episode_limit_holds_where_the_environment_has_none(
 
 def test_each_program_is_compiled_once(tmp_path: Path) -> None:
     programs.TRACES.clear()
-    for program in ("start", "store", "act", "evolve", "learn", "inject"):
+    for program in ("start", "store", "act", "_evolve", "learn", "_inject"):
         getattr(programs, program).clear_cache()  # of what other tests have compiled
     learner = LearnerConfig(hidden_sizes=(11, 9), batch_size=8, random_steps=20)
     run(tmp_path, small("probe/target", learner=learner, env_steps=60))
