@@ -8,6 +8,7 @@ from rich.console import Console
 from race.cli import seconds_since_start, streams
 from race.compilation import use_cache
 from race.config.settings import Config
+from race.envs import has_no_picture
 from race.errors import command, say
 from race.training.trainer import is_over, train
 from race.viewing.logged import logged
@@ -44,11 +45,13 @@ def run(path: Path, config: Config, *, extend: bool = False, without_metrics: bo
         console.print(f"Interrupted {kept} with: {go_on}", soft_wrap=True)
         _tell_of_silence(console, path)
         sys.exit(130)
-    following = (
+    following = [
         command("race", "evaluate", path),
         command("race", "render", path, "--out", "team.mp4"),
         command("race", "plot", path, "--out", "curves.png"),
-    )
+    ]
+    if has_no_picture(config.task):
+        del following[1]
     console.print(
         f"Finished after {progress.env_steps:,} environment steps. Next: {', '.join(following)}",
         soft_wrap=True,

@@ -20,6 +20,7 @@ __all__ = [
     "TaskInfo",
     "describe_tasks",
     "factorised",
+    "has_no_picture",
     "make_continuous_task",
     "make_discrete_task",
     "make_task",
@@ -187,6 +188,12 @@ def reads_team(task_id: str) -> bool:
 def reads_game(task_id: str) -> bool:
     """Whether a task that there is reads which interpreter plays StarCraft II."""
     return starcraft.is_game(task_id) or _own_reads_config(task_id)
+
+
+def has_no_picture(task_id: str) -> bool:
+    """Whether it is known of a task that it cannot be drawn; of one's own nothing is."""
+    probes = (*probe.PROBES, *discrete_probe.PROBES)
+    return task_id in probes or task_id.startswith(jaxmarl.PREFIX)
 
 
 def _own_reads_config(task_id: str) -> bool:

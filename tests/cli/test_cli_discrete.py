@@ -118,7 +118,8 @@ def test_training_tells_returns_and_wins(capsys: pytest.CaptureFixture[str]) -> 
     team = rf"{number} ± {number} \(\d+% won\)"
     line = rf" +45 steps, generation +3, +\d+m\d\ds: test return MARL team {team}, champion {team}"
     assert re.search(line, out), out
-    assert "Finished after 45 environment steps" in out
+    assert "Finished after 45 environment steps. Next: race evaluate" in out
+    assert "race render" not in out  # a probe has no picture
     saved = json.loads(Path("runs/probe-memory-race-facmac-seed1/config.json").read_text())
     assert (saved["discrete"], saved["base"]) == (True, "facmac")
     described = Path("runs/probe-memory-race-facmac-seed1/metadata.json").read_text()
