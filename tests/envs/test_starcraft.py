@@ -55,10 +55,10 @@ def python(tmp_path: Path, sc2path: Path) -> str:
     return written_python(tmp_path / "with smac", STAND_IN)
 
 
-def written_python(folder: Path, path: Path) -> str:
+def written_python(folder: Path, path: Path, settings: str = "") -> str:
     folder.mkdir()
     file = folder / "python"
-    file.write_text(f"#!/bin/sh\nPYTHONPATH='{path}' exec '{sys.executable}' \"$@\"\n")
+    file.write_text(f"#!/bin/sh\n{settings} PYTHONPATH='{path}' exec '{sys.executable}' \"$@\"\n")
     file.chmod(0o755)
     return str(file)
 
@@ -259,7 +259,9 @@ def test_a_game_that_dies_is_played_anew(
     assert gone(processes_of(again))
 
 
-def test_games_run_side_by_side_and_end_with_their_pool(python: str) -> None:
+def test_games_run_side_by_side_and_end_with_their_pool(sc2path: Path, tmp_path: Path) -> None:
+    # Processes of a pool have the environment of the time when the first of all was started.
+    python = written_python(tmp_path / "with smac", STAND_IN, f"SC2PATH='{sc2path}'")
     task = task_of("smac/2s3z", python)
     config = resolve(Config("smac/2s3z", algo="facmac"), discrete=True)
     for asked, beside in ((None, True), (False, False)):
