@@ -107,6 +107,20 @@ def blamed(kind: type[RaceError], what: str) -> Iterator[None]:
         raise kind(f"{what}: {described(error)}.") from error
 
 
+@contextlib.contextmanager
+def of_task(name: str) -> Iterator[None]:
+    """Messages of what is wrong with a task begin with its name.
+
+    Raises:
+        TaskError: as it was raised, with the name.
+    """
+    try:
+        yield
+    except TaskError as error:
+        text = str(error)
+        raise TaskError(text if text.startswith("Task ") else f"Task {name}: {text}") from error
+
+
 def command(*words: object) -> str:
     """A command line that a shell takes as it is meant, whatever the names in it."""
     safe = (f"./{w}" if isinstance(w, Path) and str(w).startswith("-") else str(w) for w in words)

@@ -157,12 +157,15 @@ def batch_of() -> Callable[..., Any]:
 @pytest.fixture(scope="session")
 def compiled() -> Callable[..., Callable[..., Any]]:
     """(algorithm, name, spec, config) -> that function of the algorithm, compiled once."""
+    from evolving import evolving
+
     from race.config.hyper import hyper_of
     from race.config.shape import shape_of
 
     @cache
     def make(algorithm: Any, name: str, spec: Any, config: Any) -> Callable[..., Any]:
         shape, hyper = shape_of(config), hyper_of(config)
-        return jax.jit(partial(getattr(algorithm, name), spec=spec, shape=shape, hyper=hyper))
+        function = evolving(algorithm) if name == "evolve" else getattr(algorithm, name)
+        return jax.jit(partial(function, spec=spec, shape=shape, hyper=hyper))
 
     return make

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evolving import evolving
 from whole_runs import run
 
 from race import programs
@@ -203,7 +204,7 @@ def test_evolution_with_numbers_as_arguments_gives_what_it_gives_with_constants(
     fitness, key = jnp.arange(5.0), jax.random.key(6)
 
     def evolve(hyper: Hyper) -> Any:
-        return algorithm.evolve(state, fitness, key, tiny_spec, shape, hyper)
+        return evolving(algorithm)(state, fitness, key, tiny_spec, shape, hyper)
 
     given = jax.jit(evolve)(hyper_of(config))
     fixed = jax.jit(partial(evolve, Hyper(*map(float, hyper_of(config)))))()

@@ -59,9 +59,9 @@ class Algorithm(NamedTuple):
     tested: Callable[..., tuple[Tested, ...]]
     """(state, spec) -> the MARL team (``marl``), if there is one, and the team of best training
     fitness (``champion``), if there is a population."""
-    evolve: Callable[..., Any]
-    """(state, fitness [P], key, spec, shape, hyper) -> state; line 9 of Algorithm 1. It looks at
-    the population alone."""
+    evolve: Callable[..., Population] | None
+    """(population, fitness [P], key, spec, shape, hyper) -> population; line 9 of Algorithm 1. None
+    unless there is a population."""
     update: Callable[..., tuple[Any, Losses, Losses]]
     """(state, batch, step, key, spec, shape, hyper) -> state, critic losses, policy losses; lines
     8, 10 and 13. Policy losses are zero on steps where the policy delay idles."""

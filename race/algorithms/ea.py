@@ -9,7 +9,7 @@ import jax
 from jaxtyping import Array, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested
-from race.algorithms.evolutions import evolve_state
+from race.algorithms.evolutions import evolve
 from race.algorithms.evolutions import start as start_population
 from race.algorithms.population import Population, population_of
 from race.config.hyper import Hyper
@@ -70,7 +70,7 @@ ea = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve_state,
+    evolve=evolve,
     update=_update,
     entrant=None,
     population=population_of,

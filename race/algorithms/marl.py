@@ -117,17 +117,6 @@ def tested(state: MarlState, spec: Spec) -> tuple[Tested, ...]:
     return (Tested(state.encoder.params, {"marl": heads_of(state, spec.n_agents)}),)
 
 
-def _evolve(
-    state: MarlState,
-    fitness: Float[Array, "P"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> MarlState:
-    return state
-
-
 def _population(state: MarlState) -> None:
     return None
 
@@ -136,7 +125,7 @@ marl = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=_evolve,
+    evolve=None,
     update=update,
     entrant=None,
     population=_population,

@@ -13,7 +13,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested
 from race.algorithms.ea import whole_teams
-from race.algorithms.evolutions import evolve_state
+from race.algorithms.evolutions import evolve
 from race.algorithms.marl import MarlState, heads_of, marl
 from race.algorithms.population import Population, population_of
 from race.config.hyper import Hyper
@@ -76,7 +76,7 @@ merl = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve_state,
+    evolve=evolve,
     update=update,
     entrant=entrant,
     population=population_of,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.algorithms.base import Algorithm, Losses, Teams, Tested, when
-from race.algorithms.evolutions import evolve_state
+from race.algorithms.evolutions import evolve
 from race.algorithms.evolutions import start as start_population
 from race.algorithms.population import Population, population_of
 from race.algorithms.race_update import (
@@ -151,7 +151,7 @@ race = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve_state,
+    evolve=evolve,
     update=update,
     entrant=entrant,
     population=population_of,

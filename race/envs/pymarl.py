@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from race.envs import contract
 from race.envs.checked import takes
+from race.envs.dictionary import space_of
 from race.errors import HandedOverError, RenderError, TaskError
 from race.types import DiscreteSpec, DiscreteTask
 
@@ -164,13 +165,7 @@ class PymarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         n, actions = self.sizes.n_agents, self.sizes.n_actions
         obs, state = self.sizes.obs_size, self.sizes.state_size
         self.render_mode = render_mode
-        self.observation_space = spaces.Dict(
-            {
-                "obs": spaces.Box(-np.inf, np.inf, (n, obs), np.float32),
-                "state": spaces.Box(-np.inf, np.inf, (state,), np.float32),
-                "avail_actions": spaces.MultiBinary([n, actions]),
-            }
-        )
+        self.observation_space = space_of(n, obs, state, actions)
         self.action_space = spaces.MultiDiscrete([actions] * n)
         self._env = env
         self._available: NDArray[np.int8] | None = None

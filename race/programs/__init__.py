@@ -5,7 +5,7 @@
 
 from collections import Counter
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -125,11 +125,10 @@ def evolve(
     Only the population goes through the program: with all that learns, handing the arrays over
     takes longer than the evolution.
     """
-    population = OnlyPopulation(state.population)
-    evolved = _evolve(
-        population, fitness, key, hyper=hyper, algorithm=algorithm, spec=spec, shape=shape
+    population = _evolve(
+        state.population, fitness, key, hyper=hyper, algorithm=algorithm, spec=spec, shape=shape
     )
-    return state._replace(population=evolved.population)
+    return state._replace(population=population)
 
 
 def inject(
@@ -141,15 +140,9 @@ def inject(
     return state._replace(population=_inject(state.population, entrant, key, hyper=hyper))
 
 
-class OnlyPopulation(NamedTuple):
-    """What of an algorithm's state evolves."""
-
-    population: Population
-
-
-@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="state")
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"), donate_argnames="population")
 def _evolve(
-    state: OnlyPopulation,
+    population: Population,
     fitness: Float[Array, "P"],
     key: PRNGKeyArray,
     *,
@@ -157,10 +150,10 @@ def _evolve(
     algorithm: Algorithm,
     spec: Spec,
     shape: Shape,
-) -> OnlyPopulation:
+) -> Population:
     TRACES["evolve"] += 1
-    evolved: OnlyPopulation = algorithm.evolve(state, fitness, key, spec, shape, hyper)
-    return evolved
+    assert algorithm.evolve is not None
+    return algorithm.evolve(population, fitness, key, spec, shape, hyper)
 
 
 @partial(jax.jit, donate_argnames="population")

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import NDArray
@@ -66,6 +67,11 @@ class Trial(NamedTuple):
     seeds: NDArray[np.int64]
     scaling: Scaling | None = None
     """Of what environments show the teams; None: as it is."""
+
+    def teams(self, times: int) -> Teams:
+        """All of them, each so many times in a row."""
+        heads = jnp.repeat(jnp.stack(list(self.heads.values())), times, axis=0)
+        return Teams(self.encoder, heads, scaling=self.scaling)
 
 
 class Generation(NamedTuple):

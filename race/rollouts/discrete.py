@@ -7,7 +7,6 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 from numpy.typing import NDArray
 
 from race import programs
@@ -15,7 +14,6 @@ from race.algorithms.base import Teams
 from race.config.settings import Config
 from race.errors import DivergenceError
 from race.method.exploration import epsilon
-from race.method.normalisation import Scaling
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Replay, init_replay
 from race.rollouts import device
@@ -115,14 +113,7 @@ class EpisodeRollouts:
         """At most `TESTS_AT_ONCE` episodes of each team at once."""
         longest = max(len(trial.seeds) for trial in trials)
         size = self._tests = max(self._tests, min(longest, self._most))
-        everyone = [
-            Teams(
-                t.encoder,
-                jnp.repeat(jnp.stack(list(t.heads.values())), size, axis=0),
-                scaling=t.scaling,
-            )
-            for t in trials
-        ]
+        everyone = [trial.teams(size) for trial in trials]
         found: list[list[Any]] = [[] for _ in trials]
         for first in range(0, longest, size):
             parts = [
@@ -148,15 +139,8 @@ class EpisodeRollouts:
             for i, name in enumerate(trial.heads)
         }
 
-    def episode(
-        self,
-        encoder: Any,
-        head: Float[Array, "N H1 A"],
-        seed: int,
-        scaling: Scaling | None = None,
-    ) -> NDArray[np.int32]:
-        """The actions of one episode of a team without exploration, [steps, N]."""
-        team = Teams(encoder, head[None], scaling=scaling)
+    def episode(self, team: Teams, seed: int) -> NDArray[np.int32]:
+        """The actions of one episode of a single team without exploration, [steps, N]."""
         part = Part(team, _small(np.array([seed])), None)
         ((played, _),) = self._episodes([part])
         steps = int(played.episodes.length[0])

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Any, final
 
-import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
@@ -184,14 +183,7 @@ class TransitionRollouts:
         for turn in range(rounds):
             seeds = [np.tile(of[turn], len(t.heads)) for t, of in zip(trials, pieces, strict=True)]
             acting = self._acting(
-                [
-                    Teams(
-                        t.encoder,
-                        jnp.repeat(jnp.stack(list(t.heads.values())), len(of[turn]), 0),
-                        scaling=t.scaling,
-                    )
-                    for t, of in zip(trials, pieces, strict=True)
-                ]
+                [trial.teams(len(of[turn])) for trial, of in zip(trials, pieces, strict=True)]
             )
             rollout = collect(self._pool, lambda seen, _: acting(seen), np.concatenate(seeds))  # noqa: B023
             for scores, teams in zip(found, acting.parts, strict=True):

@@ -136,9 +136,7 @@ def battle_of(trained: Trained, team: str, seed: int, seconds: float) -> tuple[B
     assert isinstance(trained.task, DiscreteTask)
     name = trained.resolve(team)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
-        actions = rollouts.episode(
-            trained.encoders[name], trained.heads[name], seed, trained.scaling
-        )
+        actions = rollouts.episode(trained.acting(name), seed)
     if seconds > 0:
         actions = actions[: math.ceil(seconds * STEPS_PER_SECOND)]
     played = make(trained.config.task.removeprefix("micro/"))

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evolving import evolving
 from test_race_update import (
     B,
     Frozen,
@@ -187,7 +188,7 @@ def evolved(
 
     @jax.jit
     def generation(hyper: Hyper) -> Any:
-        after = race.evolve(state, fitness, jax.random.key(1), tiny_spec, shape, hyper)
+        after = evolving(race)(state, fitness, jax.random.key(1), tiny_spec, shape, hyper)
         entered = inject_team(
             after.population, race.entrant(after, shape), jax.random.key(2), hyper
         )

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evolving import evolving
 from tiny_episodes import with_heads
 
 from race.algorithms import Algorithm, algorithm_of, ea, marl, merl, race
@@ -130,7 +131,7 @@ def test_functions_keep_structure_shapes_and_types(case: Case) -> None:
         partial(case.algorithm.update, **static), case.state, case.batch, step, key
     )
     evolved = jax.eval_shape(
-        partial(case.algorithm.evolve, **static), case.state, case.fitness, key
+        partial(evolving(case.algorithm), **static), case.state, case.fitness, key
     )
     injected = jax.eval_shape(case.inject, case.state)
     for after in (updated, evolved, injected):
@@ -240,7 +241,7 @@ def test_seeds_are_a_leading_axis(case: Case, batch_of: Callable[..., Any]) -> N
             np.testing.assert_allclose(a[seed], b, rtol=1e-4, atol=1e-6)
 
     fitness = jnp.stack([case.fitness, case.fitness[::-1]])
-    evolve = partial(case.algorithm.evolve, hyper=hyper_of(case.config), **case.static)
+    evolve = partial(evolving(case.algorithm), hyper=hyper_of(case.config), **case.static)
     evolved = jax.jit(jax.vmap(evolve))(stacked, fitness, keys)
     evolved = jax.vmap(case.inject)(evolved)
     for seed in range(2):

@@ -311,8 +311,8 @@ def test_a_trained_team_plays_in_python(run_of: Any) -> None:
     path = run_of("facmac", DRAWN, 10)
     trained = load_trained(path)
     with EpisodeRollouts(trained.config, trained.task) as rollouts:
-        head = trained.heads["marl"]
-        expected = [rollouts.episode(trained.encoders["marl"], head, seed) for seed in (3, 4, 5)]
+        team = trained.acting("marl")
+        expected = [rollouts.episode(team, seed) for seed in (3, 4, 5)]
     policy = trained.recurrent_policy("selected")
     env = trained.task.make(None)
     for seed, actions in zip((3, 4, 5), expected, strict=True):

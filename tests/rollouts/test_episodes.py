@@ -517,7 +517,7 @@ def test_tests_give_every_team_the_same_seeds(
                 else:
                     assert score.won is score.win_rate is None
         for team, head in heads.items():
-            actions = rollouts.episode(encoder, head, 4)
+            actions = rollouts.episode(Teams(encoder, head[None]), 4)
             length = expected[team].episodes.length[2]
             np.testing.assert_array_equal(actions, expected[team].episodes.action[2, :length])
     # Both answers are right now and then: otherwise nothing of this is seen.

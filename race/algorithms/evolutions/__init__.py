@@ -51,17 +51,4 @@ def evolve(
     return evolution_of(shape.evolution).step(population, fitness, key, spec, shape, hyper)
 
 
-def evolve_state(
-    state: Any,
-    fitness: Float[Array, "P"],
-    key: PRNGKeyArray,
-    spec: Spec,
-    shape: Shape,
-    hyper: Hyper,
-) -> Any:
-    """The same for an algorithm's state that has a ``population``."""
-    evolved = evolve(state.population, fitness, key, spec, shape, hyper)
-    return state._replace(population=evolved)
-
-
-__all__ = ["EVOLUTIONS", "Evolution", "evolution_of", "evolve", "evolve_state", "start"]
+__all__ = ["EVOLUTIONS", "Evolution", "evolution_of", "evolve", "start"]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from race.config.settings import EnvConfig
 from race.envs.jaxmarl.source import PREFIX, packages
-from race.errors import TaskError, blamed
+from race.errors import TaskError, blamed, of_task
 from race.types import DeviceEnv, DiscreteTask
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def _named(task_id: str, config: EnvConfig) -> "Adapter":
 def _adapted(make: Any, task: str, config: EnvConfig) -> "Adapter":
     from race.envs.jaxmarl.adapter import Adapter  # imports jax
 
-    with blamed(TaskError, f"Task {task}: its environment failed"):
+    with blamed(TaskError, f"Task {task}: its environment failed"), of_task(task):
         return Adapter(make(), task, config)
 
 

@@ -4,7 +4,6 @@ Letters: ``N`` agents of the team, ``O`` entries of an observation, ``A`` action
 the largest agent; ``S`` entries of the state.
 """
 
-import fnmatch
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, final
@@ -16,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from race.config.settings import EnvConfig
 from race.envs.jaxmarl.naming import names_of
+from race.envs.members import picked
 from race.errors import TaskError
 from race.types import DiscreteSpec, Observation, Outcome
 
@@ -54,7 +54,7 @@ class Adapter:
         """
         self._env, self._task = env, task
         self._agents = list(env.agents)
-        self._members = _picked(self._agents, config.agents, task)
+        self._members = picked(self._agents, config.agents)
         self._others = [agent for agent in self._agents if agent not in self._members]
         if config.others != "random":
             raise self._wrong(
@@ -227,18 +227,6 @@ class Adapter:
 
     def _wrong(self, text: str) -> TaskError:
         return TaskError(f"Task {self._task}: {text}.")
-
-
-def _picked(agents: list[Any], patterns: str, task: str) -> list[Any]:
-    # Names are texts, or numbers.
-    wanted = [part.strip() for part in patterns.split(",")]
-    for pattern in wanted:
-        if not any(fnmatch.fnmatchcase(str(agent), pattern) for agent in agents):
-            raise TaskError(
-                f"Task {task}: --env.agents {pattern} is none of its agents, which are "
-                f"{', '.join(map(str, agents))}."
-            )
-    return [agent for agent in agents if any(fnmatch.fnmatchcase(str(agent), p) for p in wanted)]
 
 
 def _own_state(shown: Any, config: EnvConfig, task: str) -> bool:

@@ -9,9 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from race.envs.dictionary import as_dictionary, space_of
 from race.envs.jaxmarl.adapter import Adapter, State
 from race.errors import RenderError
-from race.types import Observation
 
 
 @final
@@ -40,15 +40,9 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
             raise RenderError(
                 f"{spec.task} cannot be rendered here: JaxMARL's own visualizers draw its states."
             )
-        n, shape = spec.n_agents, (spec.n_agents, spec.obs_size)
+        n = spec.n_agents
         self.team_names, self.team_paid = adapter.team, [0.0] * n
-        self.observation_space = spaces.Dict(
-            {
-                "obs": spaces.Box(-np.inf, np.inf, shape, np.float32),
-                "state": spaces.Box(-np.inf, np.inf, (spec.state_size,), np.float32),
-                "avail_actions": spaces.MultiBinary([n, spec.n_actions]),
-            }
-        )
+        self.observation_space = space_of(n, spec.obs_size, spec.state_size, spec.n_actions)
         self.action_space = spaces.MultiDiscrete([spec.n_actions] * n)
         self._adapter, self.names = adapter, adapter.names()
         self._key: Any = None
@@ -64,7 +58,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         elif self._key is None:
             self._key = jax.random.key(int(self.np_random.integers(2**31)))
         self._state, seen = _reset(self._adapter, self._next_key())
-        return _as_dict(seen), {}
+        return as_dictionary(seen), {}
 
     def step(
         self, action: NDArray[Any]
@@ -81,7 +75,7 @@ class JaxmarlEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         self._state, seen, outcome, paid = _step(self._adapter, self._state, actions, now)
         self.team_paid = np.asarray(paid).tolist()
         ends = bool(outcome.terminated), bool(outcome.truncated)
-        return _as_dict(seen), float(outcome.reward), *ends, {"battle_won": bool(outcome.won)}
+        return as_dictionary(seen), float(outcome.reward), *ends, {"battle_won": bool(outcome.won)}
 
     def _next_key(self) -> Any:
         self._key, now = jax.random.split(self._key)
@@ -97,11 +91,3 @@ def _reset(adapter: Adapter, key: Any) -> Any:
 @partial(jax.jit, static_argnames="adapter")
 def _step(adapter: Adapter, state: State, actions: Any, key: Any) -> Any:
     return adapter.step_paid(state, actions, key)
-
-
-def _as_dict(seen: Observation) -> dict[str, Any]:
-    return {
-        "obs": np.asarray(seen.obs),
-        "state": np.asarray(seen.state),
-        "avail_actions": np.asarray(seen.avail_actions).astype(np.int8),
-    }

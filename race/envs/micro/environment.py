@@ -11,6 +11,7 @@ from gymnasium import spaces
 from jaxtyping import Array, Int, Key, UInt8
 from numpy.typing import NDArray
 
+from race.envs.dictionary import as_dictionary, space_of
 from race.envs.micro import Battle, load_map, make, smac
 from race.envs.micro.battle import LOOPS_PER_STEP
 from race.envs.micro.canvas import SMALL
@@ -132,13 +133,7 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         shape = played.shape
         n, actions = shape.n_allies, shape.n_actions
         self.render_mode = render_mode
-        self.observation_space = spaces.Dict(
-            {
-                "obs": spaces.Box(-np.inf, np.inf, (n, shape.obs_size), np.float32),
-                "state": spaces.Box(-np.inf, np.inf, (shape.state_size,), np.float32),
-                "avail_actions": spaces.MultiBinary([n, actions]),
-            }
-        )
+        self.observation_space = space_of(n, shape.obs_size, shape.state_size, actions)
         self.action_space = spaces.MultiDiscrete([actions] * n)
         self._battle = played
         self._painter = Painter(played, whole(played), SMALL) if render_mode else None
@@ -161,7 +156,7 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         if self._painter is not None:
             self._painter.forget()
             self._painter.see(jax.tree.map(np.asarray, self._env_state.units))
-        return _as_dict(observation), {}
+        return as_dictionary(observation), {}
 
     def step(
         self, action: NDArray[Any]
@@ -199,7 +194,7 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
         self._return += reward
         if terminated and not before.over:
             self._verdict = verdict_of(self._battle.scenario, timestep.info)
-        return _as_dict(timestep.observation), reward, terminated, False, _facts(timestep.info)
+        return as_dictionary(timestep.observation), reward, terminated, False, _facts(timestep.info)
 
     def render(self) -> UInt8[np.ndarray, "h w 3"] | None:
         """A picture of the battle as it stands, [height, width, 3]; None without a render mode.
@@ -217,14 +212,6 @@ class MicroEnv(gymnasium.Env[dict[str, Any], NDArray[np.integer[Any]]]):
     def _next_key(self) -> Any:
         self._key, now = jax.random.split(self._key)
         return now
-
-
-def _as_dict(observation: Observation) -> dict[str, Any]:
-    return {
-        "obs": np.asarray(observation.obs),
-        "state": np.asarray(observation.state),
-        "avail_actions": np.asarray(observation.avail_actions).astype(np.int8),
-    }
 
 
 def _facts(info: Info) -> dict[str, Any]:

@@ -6,9 +6,8 @@ PettingZoo: what comes out is a gymnasium environment that goes through `race.en
 
 import contextlib
 import dataclasses
-import fnmatch
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -16,13 +15,14 @@ from gymnasium import spaces
 
 from race import loading
 from race.config.settings import EnvConfig
+from race.envs.members import picked
 from race.envs.pettingzoo import source
 from race.envs.pettingzoo.environment import TeamEnv
 from race.envs.pettingzoo.parallel import Other, Parallel
 from race.envs.pettingzoo.source import PREFIX, packages
 from race.envs.pettingzoo.states import own_state, refuse_large
 from race.envs.pettingzoo.vectors import Sight
-from race.errors import TaskError, blamed
+from race.errors import TaskError, blamed, of_task
 from race.types import AnyTask, DiscreteSpec, DiscreteTask, EnvSpec, Name, Task
 
 __all__ = ["PREFIX", "TeamEnv", "make_task", "packages", "parallel_task"]
@@ -67,25 +67,15 @@ def parallel_task(
     """
     called = str(task or getattr(make, "__name__", "of yours"))
     how = f" with --env.kwargs {config.kwargs}" if called.startswith(PREFIX) else ""
-    with blamed(TaskError, f"Task {called}: making its environment{how} failed"), _told(called):
+    with blamed(TaskError, f"Task {called}: making its environment{how} failed"), of_task(called):
         env = source.made(make, None)
     try:
         name = task or str((getattr(env, "metadata", None) or {}).get("name", type(env).__name__))
-        with blamed(TaskError, f"Task {name}: its environment failed"), _told(name):
+        with blamed(TaskError, f"Task {name}: its environment failed"), of_task(name):
             return _task(make, env, name, config)
     finally:
         with contextlib.suppress(Exception, SystemExit):  # it would hide what was wrong before
             env.close()
-
-
-@contextlib.contextmanager
-def _told(name: str) -> Iterator[None]:
-    """Messages of what an environment is begin with its task's name."""
-    try:
-        yield
-    except TaskError as error:
-        text = str(error)
-        raise TaskError(text if text.startswith("Task ") else f"Task {name}: {text}") from error
 
 
 def _task(make: Callable[..., Any], env: Any, name: str, config: EnvConfig) -> AnyTask:
@@ -183,17 +173,5 @@ def _parallel(env: Any, config: EnvConfig) -> Parallel:
             "action.",
         )
     found = source.opened(env)
-    team = functools.partial(_picked, patterns=config.agents)
+    team = functools.partial(picked, patterns=config.agents)
     return Parallel(found.env, team, other, turns=found.turns)
-
-
-def _picked(agents: list[Any], patterns: str) -> list[Any]:
-    """The agents whose names match one of several patterns, in their own order."""
-    wanted = [part.strip() for part in patterns.split(",")]
-    for pattern in wanted:
-        if not any(fnmatch.fnmatchcase(str(agent), pattern) for agent in agents):
-            raise TaskError(
-                f"--env.agents {pattern} is none of its agents, which are "
-                f"{', '.join(map(str, agents))}."
-            )
-    return [a for a in agents if any(fnmatch.fnmatchcase(str(a), one) for one in wanted)]

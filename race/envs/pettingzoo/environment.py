@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from race.config.settings import TeamReward
 from race.envs import contract
+from race.envs.dictionary import space_of
 from race.envs.pettingzoo.parallel import End, Parallel
 from race.envs.pettingzoo.vectors import Choices, Reach, Sight
 from race.errors import HandedOverError, described
@@ -95,13 +96,7 @@ class TeamEnv(gymnasium.Env[Any, Any]):
             return
         n = len(parallel.team)
         self.action_space = spaces.MultiDiscrete([self.n_actions] * n)
-        self.observation_space = spaces.Dict(
-            {
-                "obs": spaces.Box(-np.inf, np.inf, (n, self.obs_size), np.float32),
-                "state": state,
-                "avail_actions": spaces.MultiBinary([n, self.n_actions]),
-            }
-        )
+        self.observation_space = space_of(n, self.obs_size, self.state_size, self.n_actions)
 
     @property
     def team_names(self) -> list[Any]:

@@ -32,9 +32,7 @@ def install(package: str) -> str:
 def missing(package: str, python: str, kind: str, facts: Mapping[str, Any]) -> str:
     """What is not installed, and how it is; empty if that is not what is wrong."""
     name = _NAMES[package]
-    make = (
-        f"Make an interpreter for it: {install(package)}; then --env.python sc2-python/bin/python"
-    )
+    make = f"Make an interpreter for it: {install(package)}; then --env.python {MADE}"
     match kind:
         case "missing":
             return f"{name} is not installed in {python}. {make}."
