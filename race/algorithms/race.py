@@ -102,11 +102,21 @@ def update(
     """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
     learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
-    head = state.policies.head.params
+    encoder, head = state.policies.encoder.params, state.policies.head.params
     team, climbing = draw_teams(state.heads, head, team_key, spec, shape)
     samples = learner.now(batch, spec)
     critics, critic_losses, value = train_critics(
-        state.critics, state.target, head, batch, samples, team, critic_key, spec, shape, hyper
+        state.critics,
+        state.target,
+        encoder,
+        head,
+        batch,
+        samples,
+        team,
+        critic_key,
+        spec,
+        shape,
+        hyper,
     )
 
     def policy_step(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:

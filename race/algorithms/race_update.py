@@ -105,6 +105,7 @@ def draw_teams(
 def train_critics(
     critics: Critics,
     target: Targets,
+    encoder: Any,
     head: Float[Array, "_ H1 A"],
     batch: Any,
     samples: Samples,
@@ -124,7 +125,12 @@ def train_critics(
     # policies alone; W_j has no slowly moving copy, but the encoder below it has.
     z = learner.encode(target.encoder, later, spec)
     marl_action = learner.target_action(z, target.head, later, marl_key, spec, hyper)
-    team_action = learner.target_action(z, team, later, team_key, spec, hyper)
+    if shape.pevfa_target == "target":
+        team_action = learner.target_action(z, team, later, team_key, spec, hyper)
+    else:
+        online = learner.encode(encoder, later, spec)
+        as_it_is = hyper._replace(smoothing_noise=0.0)
+        team_action = learner.target_action(online, team, later, team_key, spec, as_it_is)
     marl_next = _marl_values(
         target.critic, target.pevfa, later, marl_action, target.head, spec, shape
     )

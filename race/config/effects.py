@@ -25,6 +25,7 @@ _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
+    *("pevfa_target", "policy_embedding"),
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
 _OF_EVOLUTIONS = {
@@ -152,6 +153,8 @@ def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
 def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     evolves, algo = asked.has_population, asked.algo
     base = asked.base or ("facmac" if discrete else "matd3") if evolves else algo
+    if base != "matd3":
+        yield "race.policy_embedding", f"with {base}, whose PeVFA is one critic"
     if not evolves and asked.base != algo:
         yield "base", f"with --algo {algo}, which is its own gradient learner"
     if not asked.has_marl:

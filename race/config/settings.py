@@ -22,6 +22,8 @@ MutationDraw = Literal["row", "weight"]
 Level = Literal["agent", "parameter", "layer"]
 Selection = Literal["team", "agent"]
 TeamDraw = Literal["once", "each"]
+PevfaTarget = Literal["target", "online"]
+PolicyEmbedding = Literal["shared", "each"]
 EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
 TeamReward = Literal["mean", "sum"]
@@ -200,6 +202,11 @@ class RaceConfig:
     for each."""
     marl_among_teams: bool = False
     """The MARL team is among the teams that are drawn."""
+    pevfa_target: PevfaTarget = "target"
+    """Encoders over which W_j acts in the PeVFA's targets of Eq. (1): target, its actions smoothed
+    like the MARL team's, or online, its actions as they are."""
+    policy_embedding: PolicyEmbedding = "shared"
+    """Whether the two critics of a PeVFA share a policy embedding or have one each."""
     one_pevfa: bool = False
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
     marl_episodes: int = 1
@@ -400,6 +407,8 @@ _BEFORE: dict[str, Any] = {
     "selection": "team",
     "team_draw": "once",
     "marl_among_teams": False,
+    "pevfa_target": "target",
+    "policy_embedding": "shared",
     "one_pevfa": False,
     "sharing": True,
     "evolution": "ga",

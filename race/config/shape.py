@@ -2,7 +2,16 @@
 
 from dataclasses import dataclass
 
-from race.config.settings import Base, Config, Level, MutationDraw, Selection, TeamDraw
+from race.config.settings import (
+    Base,
+    Config,
+    Level,
+    MutationDraw,
+    PevfaTarget,
+    PolicyEmbedding,
+    Selection,
+    TeamDraw,
+)
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,8 @@ class Shape:
     selection: Selection
     team_draw: TeamDraw
     marl_among_teams: bool
+    pevfa_target: PevfaTarget
+    policy_embedding: PolicyEmbedding
     one_pevfa: bool
     shared_agents: bool
 
@@ -60,6 +71,7 @@ def shape_of(config: Config) -> Shape:
     mixes = learns and config.base == "facmac"
     represents = evolves and not config.whole_teams  # encoders for all teams
     genetic = evolves and race.evolution == "ga"
+    twins = config.base == "matd3"
     critic_sizes = facmac.utility_sizes if discrete else learner.hidden_sizes
     value_sizes = (facmac.value_size,) if discrete else learner.hidden_sizes
     return Shape(
@@ -86,6 +98,8 @@ def shape_of(config: Config) -> Shape:
         selection=race.selection if genetic else "team",
         team_draw=race.team_draw if represents else "once",
         marl_among_teams=race.marl_among_teams and represents,
+        pevfa_target=race.pevfa_target if represents else "target",
+        policy_embedding=race.policy_embedding if represents and twins else "shared",
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

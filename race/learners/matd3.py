@@ -50,7 +50,8 @@ def critics_of(key: PRNGKeyArray, spec: EnvSpec, shape: Shape, count: int) -> Cr
 def pevfas_of(key: PRNGKeyArray, spec: EnvSpec, shape: Shape, count: int) -> Pevfa:
     """A fresh ensemble of PeVFAs over one policy embedding."""
     sizes, size = shape.critic_sizes, shape.policy_embedding_size
-    return critics.init_pevfa(key, spec, sizes, count, shape.layer_norm, size)
+    each = shape.policy_embedding == "each"
+    return critics.init_pevfa(key, spec, sizes, count, shape.layer_norm, size, each)
 
 
 def new_critic(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Critic:

@@ -94,7 +94,7 @@ class Pevfa(eqx.Module):
     """
 
     critic: Critic
-    embedding: PolicyEmbedding
+    embedding: PolicyEmbedding  # of all critics, or one each: leading axis K
     embedding_weight: Float[Array, "K E h1"]
 
 
@@ -105,18 +105,25 @@ def init_pevfa(
     count: int,
     layer_norm: bool,
     embedding_size: int,
+    embedding_each: bool = False,
 ) -> Pevfa:
     """A fresh PeVFA; ``hidden_sizes[1]`` is also the size of the observation embeddings.
 
-    ``layer_norm`` is of the critic: the policy embedding is not normalised.
+    ``layer_norm`` is of the critic: the policy embedding is not normalised. With
+    ``embedding_each`` every critic has a policy embedding of its own.
     """
     critic_key, embedding_key, weight_key = jax.random.split(key, 3)
     critic = init_critic(critic_key, spec, hidden_sizes, count, layer_norm, embedding_size)
     fan_in = spec.state_size + spec.joint_action_size + embedding_size
     bound = 1.0 / np.sqrt(fan_in)
+
+    def embedding(key: PRNGKeyArray) -> PolicyEmbedding:
+        return init_policy_embedding(key, hidden_sizes[1] + 1, embedding_size)
+
+    each = jax.random.split(embedding_key, count) if embedding_each else ()
     return Pevfa(
         critic,
-        init_policy_embedding(embedding_key, hidden_sizes[1] + 1, embedding_size),
+        stack([embedding(key) for key in each]) if embedding_each else embedding(embedding_key),
         jax.random.uniform(
             weight_key, (count, embedding_size, hidden_sizes[0]), minval=-bound, maxval=bound
         ),
@@ -131,14 +138,26 @@ def pevfa_values(
     head: Float[Array, "N H1 A"],
 ) -> Float[Array, "K B"]:
     """``Q_theta(s, u, W_j)`` of each critic, for one team's policy representations."""
-    e = embed_policy(pevfa.embedding, head_vectors(head, spec))
-    shift = jnp.einsum("e,keh->kh", e, pevfa.embedding_weight)
+    vectors = head_vectors(head, spec)
+    if _has_one_each(pevfa):
+        e = jax.vmap(embed_policy, in_axes=(0, None))(pevfa.embedding, vectors)
+        shift = jnp.einsum("ke,keh->kh", e, pevfa.embedding_weight)
+    else:
+        e = embed_policy(pevfa.embedding, vectors)
+        shift = jnp.einsum("e,keh->kh", e, pevfa.embedding_weight)
     return q_values(pevfa.critic, state, action, shift)
 
 
 def first_pevfa(pevfa: Pevfa) -> Pevfa:
     """The first critic of the PeVFA alone."""
-    return Pevfa(first_critic(pevfa.critic), pevfa.embedding, pevfa.embedding_weight[:1])
+    embedding = pevfa.embedding
+    if _has_one_each(pevfa):
+        embedding = jax.tree.map(lambda leaf: leaf[:1], embedding)
+    return Pevfa(first_critic(pevfa.critic), embedding, pevfa.embedding_weight[:1])
+
+
+def _has_one_each(pevfa: Pevfa) -> bool:
+    return pevfa.embedding.layers[0].bias.ndim == 2
 
 
 def scale_output(critic: Critic | Pevfa, scale: Number) -> Critic | Pevfa:

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ from test_race_update import (
     q_theta,
     separate,
     sp,
+    vfm_loss,
 )
 
 from race.algorithms import marl, race
@@ -31,6 +33,7 @@ from race.config.hyper import hyper_of
 from race.config.settings import Config
 from race.config.shape import Shape, shape_of
 from race.networks import dense
+from race.networks.critics import Pevfa
 from race.types import EnvSpec
 
 
@@ -125,6 +128,77 @@ def test_one_pevfa_learns_and_is_climbed_for_all_teams(
     assert_gradients_equal(
         gradient_of(after.policies.head), numeric_gradient(policy_loss, policies.head)
     )
+
+
+# --- what the PeVFA learns from, and how it sees teams ----------------------------------------
+
+
+def of_critic(pevfa: Pevfa, k: int) -> Pevfa:
+    """With the policy embedding that one of its critics has for itself."""
+    own = jax.tree.map(lambda leaf: leaf[k], pevfa.embedding)
+    found: Pevfa = eqx.tree_at(lambda pevfa: pevfa.embedding, pevfa, own)
+    return found
+
+
+def test_pevfa_of_online_encoders_with_an_embedding_for_each_critic(
+    tiny_spec: EnvSpec,
+    tiny_config: Callable[..., Config],
+    batch_of: Callable[..., Any],
+    compiled: Callable[..., Any],
+) -> None:
+    """Smoothing would throw every target action to a bound, if there were any."""
+    config = tiny_config(
+        "race",
+        "matd3",
+        race={"pevfa_target": "online", "policy_embedding": "each"},
+        learner={"smoothing_noise": 1e3},
+    )
+    fresh, _ = start(config, tiny_spec)
+    before, batch = separate(fresh), batch_of(tiny_spec, B)
+    after, losses, policy_losses = compiled(race, "update", tiny_spec, config)(
+        before, batch, jnp.int32(1), jax.random.key(5)
+    )
+    pevfa, target = float64(before.critics.pevfa.params), float64(before.target.pevfa)
+    online, samples = params(before.policies).encoder, float64(batch)
+    first, second = pevfa.embedding.layers[0].weight
+    assert not np.allclose(first, second)
+
+    def y_of(team: np.ndarray) -> list[float]:
+        found = []
+        for b, s in enumerate(samples.next_state):
+            u = pi(online, team, tiny_spec, s)
+            value = min(q_theta(of_critic(target, k), k, tiny_spec, s, u, team) for k in range(2))
+            found.append(samples.reward[b] + (1 - samples.terminated[b]) * 0.99 * value)
+        return found
+
+    def loss(pevfa: Pevfa, team: np.ndarray, y: list[float]) -> float:
+        return sum(
+            (y[b] - q_theta(of_critic(pevfa, k), k, tiny_spec, s, samples.action[b], team)) ** 2 / B
+            for b, s in enumerate(samples.state)
+            for k in range(2)
+        )
+
+    seen = float(losses["pevfa"])
+    (team,) = (
+        head for head in float64(before.heads) if np.isclose(loss(pevfa, head, y_of(head)), seen)
+    )
+    y = y_of(team)
+    assert_slopes_equal(lambda p: loss(p, team, y), pevfa, gradient_of(after.critics.pevfa))
+    # What the encoders climb is the first critic, with its own embedding.
+    moved = params(after.critics)
+    still = np.zeros((B, 3))
+    f = Frozen(tiny_spec, samples, float64(before.target), team, 2, 0.99, (still, still))
+    head, climbed = params(before.policies).head, of_critic(moved.pevfa, 0)
+    expected = vfm_loss(online, head, moved.critic, climbed, f)
+    np.testing.assert_allclose(policy_losses["vfm"], expected, rtol=1e-4)
+
+
+def test_one_policy_embedding_for_both_critics(
+    tiny_spec: EnvSpec, tiny_config: Callable[..., Config]
+) -> None:
+    """By default."""
+    state, _ = start(tiny_config("race", "matd3"), tiny_spec)
+    assert state.target.pevfa.embedding.layers[0].weight.ndim == 2
 
 
 # --- one encoder for all agents ---------------------------------------------------------------

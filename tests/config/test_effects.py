@@ -35,6 +35,7 @@ OTHER: dict[str, Any] = {
     **{"mutation_fraction": 0.25, "vmm_weight": 0.03, "encoder_learning_rate": 0.02},
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
+    **{"pevfa_target": "online", "policy_embedding": "each"},
 }
 SETTINGS = [
     (group, field.name)
