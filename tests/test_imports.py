@@ -15,7 +15,7 @@ FLOORS: tuple[frozenset[str], ...] = tuple(
     map(
         frozenset,
         (
-            {"", "errors"},
+            {"", "closing", "errors"},
             {"loading"},
             {"config", "types"},
             {"compilation", "method", "randomness"},

@@ -1,7 +1,6 @@
 """Rollouts of tasks with discrete actions: whole episodes, on the device where that can be."""
 
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import Any, final
 
 import jax
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from race import programs
 from race.algorithms.base import Teams
+from race.closing import Closing
 from race.config.settings import Config
 from race.errors import DivergenceError
 from race.method.exploration import epsilon
@@ -31,7 +31,7 @@ TESTS_AT_ONCE_ON_HOST = 4
 
 
 @final
-class EpisodeRollouts:
+class EpisodeRollouts(Closing):
     """A `race.rollouts.base.Rollouts`: on the device if the task can be played there."""
 
     def __init__(
@@ -149,17 +149,6 @@ class EpisodeRollouts:
     def close(self) -> None:
         """Closes the environments on the host."""
         self._host.close()
-
-    def __enter__(self) -> "EpisodeRollouts":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def _episodes(self, parts: Sequence[Part]) -> Iterator[tuple[Played, int]]:
         """The episodes of each run, and how many have been begun anew by then."""

@@ -1,6 +1,5 @@
 """Episodes of tasks with discrete actions on the host, such as the real StarcraftII."""
 
-from types import TracebackType
 from typing import final
 
 import jax
@@ -8,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.algorithms.base import Teams
+from race.closing import Closing
 from race.envs.contract import Step
 from race.errors import EnvFailedError
 from race.randomness import seed_again
@@ -21,7 +21,7 @@ _blank = jax.jit(blank)
 
 
 @final
-class HostEnvs:
+class HostEnvs(Closing):
     """Environments of one task on the host, played by teams. Close the pool after use.
 
     Attributes:
@@ -97,17 +97,6 @@ class HostEnvs:
     def close(self) -> None:
         """Closes the environments."""
         self.pool.close()
-
-    def __enter__(self) -> "HostEnvs":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Playing:

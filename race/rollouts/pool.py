@@ -4,11 +4,11 @@ import functools
 import os
 import time
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import Any, Final, final
 
 import numpy as np
 
+from race.closing import Closing
 from race.compilation import cores
 from race.envs.checked import CheckedEnv
 from race.envs.contract import Seen, Step
@@ -28,7 +28,7 @@ _MOST_PROCESSES: Final = 16
 
 
 @final
-class EnvPool:
+class EnvPool(Closing):
     """Environments of one task, one for each of some teams; they are made when they are needed.
 
     In this process they are stepped one after the other; with processes, each environment has one
@@ -224,17 +224,6 @@ class EnvPool:
         elif worker is not None and worker not in self._workers.values():
             _close(worker.close)
         return error
-
-    def __enter__(self) -> "EnvPool":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def _close(close: Callable[[], None]) -> list[TaskError]:

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Callable, Sequence
-from types import TracebackType
 from typing import Any, final
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from race import programs
 from race.algorithms.base import Teams
+from race.closing import Closing
 from race.config.settings import Config
 from race.errors import DivergenceError
 from race.method.normalisation import Observed, observed_more, running_of
@@ -38,7 +38,7 @@ def empty_transition(spec: EnvSpec) -> Transition:
 
 
 @final
-class TransitionRollouts:
+class TransitionRollouts(Closing):
     """A `race.rollouts.base.Rollouts`. Environments are made when they are needed first."""
 
     def __init__(
@@ -200,17 +200,6 @@ class TransitionRollouts:
     def close(self) -> None:
         """Closes the environments and ends their processes."""
         self._pool.close()
-
-    def __enter__(self) -> "TransitionRollouts":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 @final

@@ -12,12 +12,12 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, NamedTuple, final
 
 import jax
 import numpy as np
 
+from race.closing import Closing
 from race.errors import ConfigError, RunDirectoryError, command
 from race.runs.sealed import parse, parse_object
 
@@ -33,7 +33,7 @@ class Extent(NamedTuple):
 
 
 @final
-class MetricsWriter:
+class MetricsWriter(Closing):
     """Appends rows to a file; each is handed to the operating system before `write` returns.
 
     A checkpoint records `extent` after `sync`. Opened with it, the file loses the rows that were
@@ -122,17 +122,6 @@ class MetricsWriter:
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
-
-    def __enter__(self) -> "MetricsWriter":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 def read(path: Path, run: str | None = None, kept: Extent | None = None) -> list[dict[str, Any]]:
