@@ -38,7 +38,7 @@ SMALL = {
     "doctor": "",
 }
 
-READERS = {"plot", "compare", "report"}
+READERS = {"plot", "compare", "report", "reproduce"}
 """Commands that read results."""
 
 CONTINUOUS = (
@@ -49,6 +49,8 @@ CONTINUOUS = (
 
 def small(words: list[str]) -> list[str]:
     """A command that is done soon."""
+    if "--draw-only" in words:
+        return words
     options = shlex.split(SMALL[words[0]])
     if "--seeds" in words:
         options += ["--seeds", "1-2"]

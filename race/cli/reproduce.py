@@ -53,6 +53,9 @@ class Reproduce:
     must lie in a folder that all machines share. Needs race-marl[ray]; see docs/cluster.md."""
     dir: Path = Path("runs/reproduce")
     """Where runs and figures are kept."""
+    known: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="PATH...")] = ()
+    """Run directories, folders of them or archives (`race archive`) in which complete runs of the
+    figures may be: they are drawn, and not trained again."""
     dry_run: bool = False
     """Say what would be run, with memory and, where runs of the kind have begun, time."""
     draw_only: bool = False
@@ -82,7 +85,9 @@ def main(arguments: list[str]) -> None:
     from race.compilation import use_cache
     from race.config.seeds import parse_seeds
     from race.reproduce.figures import FIGURES
+    from race.reproduce.known import known_of
     from race.reproduce.planning import plan
+    from race.runs import results
 
     if not chosen.figures:
         raise ConfigError("Say which figure: race reproduce {fig2,...,fig8,all}")
@@ -100,35 +105,39 @@ def main(arguments: list[str]) -> None:
     )
     os.environ.update(SHARED_ACCELERATOR)  # this process only watches
     use_cache()
+    known = known_of(made.runs, results.load(chosen.known))
+    missing = {name: config for name, config in made.runs.items() if name not in known}
+    if known or chosen.known:
+        print(f"{len(known)} of {len(made.runs)} runs are known.", file=sys.stderr)
     if chosen.dry_run:
-        show_plan(chosen.dir, made.runs, chosen.cohort)
+        show_plan(chosen.dir, missing, chosen.cohort)
         return
     failure = None
-    if not chosen.draw_only:
-        create_runs(chosen.dir, made.runs, chosen.log)
-        places = [chosen.dir / name for name in made.runs]
+    if missing and not chosen.draw_only:
+        create_runs(chosen.dir, missing, chosen.log)
+        places = [chosen.dir / name for name in missing]
         try:
             run_all(chosen.dir, places, jobs=chosen.jobs, cohort=chosen.cohort, on=chosen.on)
         except RaceError as error:  # what the others did is drawn all the same
             failure = error
-    _draw(chosen, figures, made)
+    _draw(chosen, figures, made, known)
     if failure is not None:
         raise failure
 
 
-def _draw(chosen: Reproduce, figures: tuple[str, ...], made: Any) -> None:
+def _draw(chosen: Reproduce, figures: tuple[str, ...], made: Any, known: dict[str, Any]) -> None:
     from race.reproduce.drawing import draw_figure
     from race.reproduce.figures import FIGURES
     from race.runs import results
     from race.runs.directory import RunDirectory
 
-    there = [n for n in made.runs if RunDirectory(chosen.dir / n).config.exists()]
+    there = [n for n in made.runs if n in known or RunDirectory(chosen.dir / n).config.exists()]
     if not there:
         raise RaceError(
             f"There is no run of these figures in {chosen.dir}. Leave --draw-only away to train "
-            "them, or name the folder with --dir."
+            "them, or name the folder with --dir, or others that hold them with --known."
         )
-    recorded = {name: results.of_directory(chosen.dir / name) for name in there}
+    recorded = {n: known.get(n) or results.of_directory(chosen.dir / n) for n in there}
     for figure in figures:
         runs = [(recorded[n], p) for n in there for p in made.seen[n] if p.figure == figure]
         tasks, out = chosen.tasks or FIGURES[figure].tasks, chosen.dir / f"{figure}.png"

@@ -145,7 +145,7 @@ def _draw_rates(
     axes.set_ylim(0, 1)
     axes.set_ylabel("share of injected MARL teams")
     axes.set_title(f"{name}: what became of injected MARL teams (95%)", fontsize="medium")
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1, 1))
     with written_aside(out) as temporary:
         canvas.savefig(temporary, dpi=130)
     return Drawn(out, [f"{name}: {task} has no rate yet" for task in tasks if task not in ends])

@@ -14,7 +14,9 @@ from race.envs import make_task
 from race.errors import ConfigError
 from race.reproduce import paper
 from race.reproduce.figures import FIGURES, variants
+from race.reproduce.known import known_of
 from race.reproduce.planning import Plan, plan
+from race.runs import archive, results
 from race.training.asking import settled
 
 ASKED = Config("")
@@ -121,6 +123,42 @@ def test_figures_are_drawn_with_gaps_said(
         assert picture.std() > 5
         assert f"{figure}.png" in told.out
     assert "fig2: 2 runs are not begun" in told.err
+
+
+def test_known_runs_are_drawn_and_not_trained_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of an archive, too; not those of other settings, seeds or lengths, nor unfinished ones."""
+    made = planned("fig2", tasks=(CHEETAH,), env_steps=400_000)
+    ends = {"matd3": 500_000, "merl": 300_000, "race": 500_000}
+    for name, config in made.runs.items():
+        if config.algo in ends:
+            run = tmp_path / "kept" / name
+            told = {name: getattr(config, name) for name in ("task", "algo", "base", "seed")}
+            written_run(run, [(ends[config.algo], 1000.0)], None, env_steps=400_000, **told)
+    kept = results.load([tmp_path / "kept"])
+    known = known_of(made.runs, kept)
+    assert {run.config.algo for run in known.values()} == {"matd3", "race"}
+    assert all(made.runs[name].algo == run.config.algo for name, run in known.items())
+    for other in (
+        planned("fig2", tasks=(CHEETAH,), env_steps=400_001),
+        planned("fig2", tasks=(CHEETAH,), env_steps=400_000, seeds=(2,)),
+        planned("fig2", tasks=(CHEETAH,), env_steps=400_000, preset="demo"),
+        planned("fig2", tasks=("mamujoco/Ant-4x2",), env_steps=400_000),
+    ):
+        assert not known_of(other.runs, kept)
+    packed = tmp_path / f"kept{archive.SUFFIX}"
+    archive.write(packed, kept)
+    words = ["--tasks", CHEETAH, "--env-steps", "400000", "--seeds", "1", "--known", str(packed)]
+    out = tmp_path / "figures"
+    main(["reproduce", "fig2", *words, "--dir", str(out), "--dry-run"])
+    told = capsys.readouterr()
+    assert "2 of 5 runs are known" in told.err
+    assert told.out.count(" new\n") == 3
+    main(["reproduce", "fig2", *words, "--dir", str(out), "--draw-only"])
+    assert iio.imread(out / "fig2.png").std() > 5
+    assert [file.name for file in out.iterdir()] == ["fig2.png"]
+    assert "3 runs are not begun" in capsys.readouterr().err
 
 
 def test_a_plan_is_shown_with_the_time_that_is_left(
