@@ -18,6 +18,7 @@ class Purpose(IntEnum):
     LEARNING = 4
     EVALUATION = 5
     INJECTION = 6
+    SURROGATE = 7
 
 
 def root_key(seed: int, purpose: Purpose) -> PRNGKeyArray:

@@ -74,6 +74,7 @@ ea = Algorithm(
     update=_update,
     entrant=None,
     population=population_of,
+    expected=None,
     critic_losses=(),
     policy_losses=(),
 )

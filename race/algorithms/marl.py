@@ -129,6 +129,7 @@ marl = Algorithm(
     update=update,
     entrant=None,
     population=_population,
+    expected=None,
     critic_losses=("critic",),
     policy_losses=("policy",),
 )

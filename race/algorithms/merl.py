@@ -80,6 +80,7 @@ merl = Algorithm(
     update=update,
     entrant=entrant,
     population=population_of,
+    expected=None,
     critic_losses=marl.critic_losses,
     policy_losses=marl.policy_losses,
 )

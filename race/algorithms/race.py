@@ -146,6 +146,24 @@ def update(
     return moved, critic_losses, policy_losses
 
 
+def expected(
+    state: RaceState, states: Float[Array, "T S"], spec: Spec, shape: Shape
+) -> Float[Array, "T"]:
+    """``Q_theta(s, pi_j(s), W_j)`` of all teams, the MARL team among them."""
+    learner = learner_of(shape)
+    acting, pevfa = teams(state, spec, shape), state.critics.pevfa.params
+    unused = jax.random.key(0)  # policies of continuous actions are deterministic
+
+    def of_one(head: Float[Array, "N H1 A"], at: Float[Array, "S"]) -> Float[Array, ""]:
+        moments = at[None]
+        z = learner.encode(acting.encoder, moments, spec)
+        action = learner.act(z, head, moments, unused, spec)
+        values = learner.q_team(pevfa, moments, action, head, spec)
+        return learner.pessimistic(values)[0]
+
+    return jax.vmap(of_one)(acting.heads, states)
+
+
 def entrant(state: RaceState, shape: Shape) -> Team:
     """Of line 11: the MARL team's heads."""
     return Team(None, _marl_team(state))
@@ -165,6 +183,7 @@ race = Algorithm(
     update=update,
     entrant=entrant,
     population=population_of,
+    expected=expected,
     critic_losses=CRITIC_LOSSES,
     policy_losses=POLICY_LOSSES,
 )

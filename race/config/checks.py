@@ -174,6 +174,13 @@ def check(config: Config) -> None:
             learner.shared_agents,
             "False where whole teams evolve: each of their agents has an encoder of its own",
         ),
+        (
+            0 <= race.surrogate_probability <= 1,
+            "race.surrogate-probability",
+            race.surrogate_probability,
+            "from 0 to 1",
+        ),
+        (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         *_population_rules(race),
         (

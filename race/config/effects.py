@@ -21,11 +21,12 @@ _PARALLEL = (
     *("agents", "others", "team_reward", "state", "episode_limit"),
     "largest_observation",
 )
+_SURROGATE = ("surrogate_probability", "surrogate_steps")
 _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
-    *("pevfa_target", "policy_embedding"),
+    *("pevfa_target", "policy_embedding", *_SURROGATE),
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
 _OF_EVOLUTIONS = {
@@ -155,6 +156,11 @@ def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]
     base = asked.base or ("facmac" if discrete else "matd3") if evolves else algo
     if base != "matd3":
         yield "race.policy_embedding", f"with {base}, whose PeVFA is one critic"
+    if discrete:
+        why = f"on {asked.task}, whose actions are discrete"
+        yield from ((f"race.{name}", why) for name in _SURROGATE)
+    elif asked.race.surrogate_probability == 0:
+        yield "race.surrogate_steps", "with --race.surrogate-probability 0"
     if not evolves and asked.base != algo:
         yield "base", f"with --algo {algo}, which is its own gradient learner"
     if not asked.has_marl:

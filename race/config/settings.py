@@ -211,6 +211,12 @@ class RaceConfig:
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
+    surrogate_probability: float = 0.0
+    """Probability that a generation judges the population by the beginnings of its episodes and
+    what the PeVFA expects after them, as the code does that the paper's evolution is taken from;
+    else by whole episodes. On tasks with continuous actions."""
+    surrogate_steps: int = 200
+    """Steps of such a beginning."""
     evolution_from: int = 0
     """Environment steps before which the MARL team plays alone and nothing evolves."""
     tournament_size: int = 3
@@ -408,6 +414,8 @@ _BEFORE: dict[str, Any] = {
     "team_draw": "once",
     "marl_among_teams": False,
     "pevfa_target": "target",
+    "surrogate_probability": 0.0,
+    "surrogate_steps": 200,
     "policy_embedding": "shared",
     "one_pevfa": False,
     "sharing": True,

@@ -205,6 +205,25 @@ def start(
     return algorithm.init(key, spec, shape, hyper)
 
 
+@partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
+def expected(
+    state: Any,
+    states: Float[np.ndarray, "T S"],
+    *,
+    algorithm: Algorithm,
+    spec: Spec,
+    shape: Shape,
+    scaling: Scaling | None = None,
+) -> Float[Array, "T"]:
+    """What each of the teams that act is worth where it is, by the PeVFA."""
+    TRACES["expected"] += 1
+    assert algorithm.expected is not None
+    shown = jnp.asarray(states)
+    if scaling is not None:
+        shown = scaled(shown, scaling.state)
+    return algorithm.expected(state, shown, spec, shape)
+
+
 @jax.jit
 def all_finite(state: Any) -> Bool[Array, ""]:
     """Whether every number of a state is finite."""

@@ -15,6 +15,7 @@ from race.config.settings import Config
 from race.errors import DivergenceError
 from race.method.normalisation import Observed, Scaling
 from race.replay.buffer import Replay
+from race.rollouts.beginnings import Beginnings
 
 Steps = Callable[[int], None]
 """Told how many environment steps have been made."""
@@ -57,6 +58,9 @@ class Play(NamedTuple):
     generation: int
     env_steps: int
     replay: Replay
+    beginnings: int | None = None
+    """Steps after which the population stops, which is judged by them; None: it plays to the end.
+    The MARL team does so in any case."""
 
 
 class Trial(NamedTuple):
@@ -83,6 +87,8 @@ class Generation(NamedTuple):
     """Episodes that were begun anew because an environment failed."""
     observed: Observed | None = None
     """What all teams saw, where observations are normalised."""
+    beginnings: Beginnings | None = None
+    """Of all teams, where the population played no more; their returns are of what was played."""
 
 
 class WarmUp(NamedTuple):

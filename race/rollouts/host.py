@@ -19,7 +19,10 @@ _FIRST_ROWS: Final = 65536  # memory that is never written costs nothing
 
 
 def collect(
-    pool: EnvPool, act: Act, seeds: NDArray[np.int64], max_ticks: int | None = None
+    pool: EnvPool,
+    act: Act,
+    seeds: NDArray[np.int64],
+    max_ticks: int | NDArray[np.int64] | None = None,
 ) -> Rollout:
     """One episode per team, all teams in step with each other.
 
@@ -34,7 +37,7 @@ def collect(
             teams whose episode has ended are ignored; their states stay as they were at the end.
         seeds: for each team, the seed of its environment's reset, [T].
         max_ticks: steps after which running episodes are cut (not terminated), if that is before
-            the task's own limit.
+            the task's own limit; of all teams, or of each [T].
 
     Returns:
         Transitions in order of attempt, tick, then team; actions as `act` gave them, clipped.
@@ -45,12 +48,13 @@ def collect(
         EnvFailedError: if an environment fails.
     """
     spec: EnvSpec = pool.spec
-    limit = spec.episode_limit if max_ticks is None else min(max_ticks, spec.episode_limit)
-    found = _Found(len(seeds), limit, spec)
+    cut = spec.episode_limit if max_ticks is None else max_ticks
+    limits = np.broadcast_to(np.minimum(cut, spec.episode_limit), len(seeds))
+    found = _Found(len(seeds), int(limits.max(initial=0)), spec)
     waiting = {team: int(seed) for team, seed in enumerate(seeds.tolist())}
     attempt = 0
     while waiting:
-        failures = _play(pool, act, waiting, limit, found)
+        failures = _play(pool, act, waiting, limits, found)
         attempt += 1
         pool.begin_again(failures, attempt)
         found.repeated[list(failures)] += 1
@@ -60,7 +64,7 @@ def collect(
 
 
 def _play(
-    pool: EnvPool, act: Act, seeds: dict[int, int], limit: int, found: "_Found"
+    pool: EnvPool, act: Act, seeds: dict[int, int], limits: NDArray[np.int64], found: "_Found"
 ) -> dict[int, EnvFailedError]:
     """An episode of each of some teams; returns those that failed."""
     spec = pool.spec
@@ -72,8 +76,8 @@ def _play(
             failures[team] = seen
         else:
             states[team] = seen
-    alive = np.array(sorted(set(seeds) - set(failures)), np.intp)
-    for tick in range(limit):
+    alive = np.array([t for t in sorted(set(seeds) - set(failures)) if limits[t] > 0], np.intp)
+    for tick in range(limits.max(initial=0)):
         if not alive.size:
             break
         actions = _chosen(act, states, tick, alive, spec)
@@ -89,7 +93,7 @@ def _play(
                 continue
             states[team] = step.seen
             found.add(team, before[team], actions[team], step)
-            if not (step.terminated or step.truncated):
+            if not (step.terminated or step.truncated or tick + 1 == limits[team]):
                 running.append(team)
         alive = np.array(running, np.intp)
     found.states = states

@@ -17,6 +17,7 @@ from race.programs import cohort
 from race.randomness import Purpose, host_seeds
 from race.replay.buffer import Replay, init_replay
 from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp
+from race.rollouts.beginnings import beginnings
 from race.rollouts.host import collect
 from race.rollouts.pool import EnvPool
 from race.types import EnvSpec, Rollout, Task, Transition
@@ -132,7 +133,11 @@ class TransitionRollouts(Closing):
                 replay = store(replay, scaled(played.transitions, scale))
             steps, repeated = len(played.transitions.reward), int(played.repeated.sum())
             observed = seen_by(played, play.config)
-            made = Generation(played.episode_return, steps, repeated, observed)
+            begun = None
+            if play.beginnings is not None:
+                discount = play.config.learner.discount
+                begun = beginnings(played, play.beginnings, discount)
+            made = Generation(played.episode_return, steps, repeated, observed, begun)
             results.append((replay, made))
         return results
 
@@ -169,7 +174,22 @@ class TransitionRollouts(Closing):
                 actions[exploring] += scale * noise.standard_normal(shape, np.float32)
             return actions
 
-        rollout = collect(self._pool, choose, np.concatenate([part[:-1] for part in seeds]))
+        longest = [
+            np.full(play.teams.count, spec.episode_limit)
+            if play.beginnings is None
+            else np.where(
+                np.arange(play.teams.count) < play.teams.count - play.n_marl,
+                play.beginnings,
+                spec.episode_limit,
+            )
+            for play in plays
+        ]
+        rollout = collect(
+            self._pool,
+            choose,
+            np.concatenate([part[:-1] for part in seeds]),
+            np.concatenate(longest),
+        )
         return [rollout.of(teams) for teams in acting.parts]
 
     def test(self, trials: Sequence[Trial]) -> list[dict[str, Score]]:

@@ -110,7 +110,7 @@ def _roll_out(
             after[c] = result
             continue
         replay, played = result
-        state = noted(states[c]._replace(replay=replay), played, play.n_marl)
+        state = noted(runs[c], states[c]._replace(replay=replay), played, play.n_marl)
         after[c] = evolve(runs[c], state)
         jax.block_until_ready(replay)
         runs[c].clock.rolled_out()

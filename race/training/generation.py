@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from race import programs
 from race.algorithms.base import Tested
@@ -18,6 +19,7 @@ from race.errors import CheckpointError, DivergenceError, RunDirectoryError
 from race.method.normalisation import Observed, observed_more
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
+from race.rollouts.beginnings import Beginnings
 from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
@@ -58,14 +60,26 @@ def to_play(run: Run, state: RunState) -> Play:
     if n_marl:
         teams = teams.last_again(n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
-    return Play(config, teams, n_marl, progress.generation, progress.env_steps, state.replay)
+    steps = config.race.surrogate_steps if _surrogate_due(config, progress) else None
+    return Play(config, teams, n_marl, progress.generation, progress.env_steps, state.replay, steps)
 
 
-def noted(state: RunState, played: Generation, n_marl: int) -> RunState:
+def _surrogate_due(config: Config, progress: Progress) -> bool:
+    """Whether beginnings of episodes are to judge the population: by chance, once it can be."""
+    share = config.race.surrogate_probability
+    if share == 0 or progress.gradient_steps == 0:
+        return False
+    seeds = host_seeds(config.seed, Purpose.SURROGATE, progress.generation, 1)
+    return bool(np.random.default_rng(int(seeds[0])).random() < share)
+
+
+def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunState:
     """The state with the results of the episodes; the generation's gradient steps are next."""
     progress, returns = state.progress, played.episode_return.tolist()
     n_teams = len(returns) - n_marl
-    fitness, of_marl = returns[:n_teams], returns[n_teams:]
+    fitness, of_marl, marl_fitness = returns[:n_teams], returns[n_teams:], None
+    if played.beginnings is not None and n_teams:
+        *fitness, marl_fitness = _judged(run, state, played.beginnings)
     progress = progress.but(
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
@@ -74,10 +88,26 @@ def noted(state: RunState, played: Generation, n_marl: int) -> RunState:
         generation=progress.generation + 1,
         fitness=tuple(fitness),
         marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
+        marl_fitness=marl_fitness,
         learning=True,
         repeated=progress.repeated + played.repeated,
     )
     return _observed(state._replace(progress=progress), played.observed)
+
+
+def _judged(run: Run, state: RunState, begun: Beginnings) -> list[float]:
+    """Discounted returns of all teams, of which the PeVFA guesses what lies behind a beginning.
+
+    In the task's own units, whatever rewards are multiplied by for learning. Of several episodes of
+    the MARL team, the first counts.
+    """
+    one_each = slice(run.config.race.population_size + 1)
+    values = programs.expected(
+        state.algorithm, begun.state[one_each], **run.statics, scaling=state.scaling
+    )
+    ahead = np.asarray(values, np.float64) / run.config.env.reward_scale
+    judged: list[float] = (begun.rewards[one_each] + begun.weight[one_each] * ahead).tolist()
+    return judged
 
 
 def _observed(state: RunState, now: Observed | None) -> RunState:

@@ -29,6 +29,8 @@ def generation_row(
     if progress.marl_return is not None:
         row["marl/return"] = progress.marl_return
     if progress.fitness:
+        if config.race.surrogate_probability:
+            row["population/surrogate"] = progress.marl_fitness is not None
         row["population/fitness_max"] = max(progress.fitness)
         row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
         row["population/fitness_min"] = min(progress.fitness)
@@ -40,8 +42,11 @@ def generation_row(
                 row[f"injection/{name}_rate"] = count / sum(fates) if sum(fates) else None
         record = population.record
         counts = (np.asarray(column).tolist() for column in (record.children, record.better))
+        # Estimates do not compare with returns of the generation before.
+        alike = config.race.surrogate_probability == 0
         for name, children, better in zip(OPERATORS, *counts, strict=True):
-            row[f"operators/{name}_better_rate"] = better / children if children else None
+            rate = better / children if children and alike else None
+            row[f"operators/{name}_better_rate"] = rate
         if progress.fitness:
             row["teams"] = rows(record.played, progress.fitness)
     for name, total in losses.items():

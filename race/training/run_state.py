@@ -38,10 +38,14 @@ class Progress:
     env_steps_before: int = 0
     """Environment steps before the current generation."""
     fitness: tuple[float, ...] = ()
-    """Training returns of the population in the newest generation; empty without one."""
+    """Training returns of the population in the newest generation, or what it was judged by in
+    place of them; empty without one."""
     marl_return: float | None = 0.0
     """Training return of the MARL team in the newest generation, the mean of its episodes; None
     where there is no such team."""
+    marl_fitness: float | None = None
+    """What the MARL team would be judged by, where the population is judged by no whole episodes;
+    None where its return is what compares."""
     evaluated_at: int = 0
     """``env_steps`` of the newest evaluation."""
     wall_seconds: float = 0.0
@@ -60,7 +64,8 @@ class Progress:
         """Of the MARL team and the champion, the one with the better training return."""
         if self.marl_return is None:
             return "champion"
-        return "champion" if self.fitness and max(self.fitness) > self.marl_return else "marl"
+        rival = self.marl_return if self.marl_fitness is None else self.marl_fitness
+        return "champion" if self.fitness and max(self.fitness) > rival else "marl"
 
     @property
     def times(self) -> dict[str, float]:

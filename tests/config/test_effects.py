@@ -35,7 +35,7 @@ OTHER: dict[str, Any] = {
     **{"mutation_fraction": 0.25, "vmm_weight": 0.03, "encoder_learning_rate": 0.02},
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
-    **{"pevfa_target": "online", "policy_embedding": "each"},
+    **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
 }
 SETTINGS = [
     (group, field.name)
@@ -67,7 +67,10 @@ def read_on_host(config: Config, group: str, name: str) -> bool:
     """Settings that neither `Shape` nor `Hyper` shows."""
     if group == "race":
         beside = config.has_population and config.has_marl
-        return beside and name in ("marl_episodes", "evolution_from")
+        return beside and (
+            name in ("marl_episodes", "evolution_from")
+            or (name == "surrogate_probability" and not (config.discrete or config.whole_teams))
+        )
     mine = group == ("facmac" if config.discrete else "learner")
     return mine and (
         (config.has_marl and name in ON_HOST[config.discrete]) or name == "replay_precision"
