@@ -208,7 +208,7 @@ def start(
 @partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
 def expected(
     state: Any,
-    states: Float[np.ndarray, "T S"],
+    states: Float[Array, "T S"] | Float[np.ndarray, "T S"],
     *,
     algorithm: Algorithm,
     spec: Spec,

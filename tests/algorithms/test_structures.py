@@ -201,6 +201,29 @@ def test_one_policy_embedding_for_both_critics(
     assert state.target.pevfa.embedding.layers[0].weight.ndim == 2
 
 
+def test_what_teams_are_worth_where_they_are(
+    tiny_spec: EnvSpec, tiny_config: Callable[..., Config]
+) -> None:
+    """The smaller of the PeVFA's two values of each team, the MARL team the last."""
+    config = tiny_config("race", "matd3")
+    fresh, shape = start(config, tiny_spec)
+    state = separate(fresh)
+    size = config.race.population_size + 1
+    states = np.random.default_rng(0).normal(size=(size, tiny_spec.state_size))
+    found = jax.jit(lambda at: race.expected(state, at, tiny_spec, shape))(
+        jnp.asarray(states, jnp.float32)
+    )
+    encoder = params(state.policies).encoder
+    heads = [*float64(state.heads), params(state.policies).head]
+    pevfa = float64(state.critics.pevfa.params)
+    expected = []
+    for at, head in zip(states, heads, strict=True):
+        u = pi(encoder, head, tiny_spec, at)
+        expected.append(min(q_theta(pevfa, k, tiny_spec, at, u, head) for k in range(2)))
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+    assert np.std(expected) > 1e-3
+
+
 # --- one encoder for all agents ---------------------------------------------------------------
 
 

@@ -13,6 +13,7 @@ import pytest
 from race.envs import factorised, make_task
 from race.envs.contract import in_units
 from race.errors import DivergenceError, EnvFailedError, HandedOverError
+from race.rollouts.beginnings import beginnings
 from race.rollouts.host import collect
 from race.rollouts.pool import EnvPool
 
@@ -113,6 +114,30 @@ def test_max_ticks_cuts_without_terminating():
         assert rollout.episode_length.tolist() == [1, 1, 1]
         assert len(collect(pool, zeros, SEEDS, max_ticks=0).transitions.reward) == 0
         check_countdown(collect(pool, zeros, SEEDS, max_ticks=100))  # no trace of the cut episodes
+
+
+def test_each_team_may_be_cut_by_itself():
+    with EnvPool(countdown_task(), 3, processes=False) as pool:
+        rollout = collect(pool, zeros, SEEDS, max_ticks=np.array([9, 1, 0]))
+        assert rollout.transitions.reward.tolist() == [1, 21, 2]
+        assert rollout.transitions.terminated.tolist() == [0, 0, 1]
+        assert rollout.team.tolist() == [0, 1, 0]
+        assert rollout.episode_length.tolist() == [2, 1, 0]
+
+
+def test_beginnings_of_episodes():
+    """Of two steps: team 0 ends with its second, the others go on; worked out by hand."""
+    with EnvPool(countdown_task(), 3, processes=False) as pool:
+        rollout = collect(pool, zeros, SEEDS)
+    found = beginnings(rollout, 2, 0.5)
+    assert found.rewards.tolist() == [1 + 0.5 * 2, 21 + 0.5 * 22, 11 + 0.5 * 12]
+    assert found.weight.tolist() == [0, 0.25, 0.25]
+    assert found.state.tolist() == [[0, 2], [2, 2], [1, 2]]
+    # Of more than there are: what there is.
+    found = beginnings(rollout, 4, 0.5)
+    assert found.rewards[0] == 2
+    assert found.rewards[2] == 11 + 6 + 13 / 4
+    assert found.weight.tolist() == [0, 0, 0.125]
 
 
 def test_arrays_grow(monkeypatch):

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import types
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from whole_runs import KilledError, rows, run
 
+from race import programs
 from race.algorithms.lineage import ORIGINS
 from race.config.presets import resolve
 from race.config.settings import (
@@ -186,6 +188,59 @@ def test_the_marl_team_may_play_more_often_and_alone_at_first(
     assert all(team["origin"] == "initial" for team in together[0]["teams"])
     assert [team["origin"] for team in together[1]["teams"]].count("injected") == 1
     assert len(progress.fitness) == POPULATION
+
+
+def test_beginnings_of_episodes_may_judge_the_population(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of ten steps that pay 1 each, cut after three, at a discount of a half."""
+    monkeypatch.setattr(learning, "CHUNK", 7)
+    expected: list[np.ndarray] = []
+
+    def noting(*args: Any, **more: Any) -> np.ndarray:
+        expected.append(np.asarray(programs.expected(*args, **more), np.float64))
+        return expected[-1]
+
+    judging = types.SimpleNamespace(**{**vars(programs), "expected": noting})
+    config = small("race", "matd3", "probe/time-limit", surrogate_probability=0.5)
+    config = dataclasses.replace(
+        config,
+        env_steps=250,
+        learner=dataclasses.replace(config.learner, discount=0.5),
+        race=dataclasses.replace(config.race, surrogate_steps=3),
+        env=dataclasses.replace(config.env, reward_scale=2.0),
+    )
+    with monkeypatch.context() as patched:
+        patched.setattr(generation, "programs", judging)
+        progress = run(tmp_path / "whole", config)
+    generations = rows(tmp_path / "whole", "generation")
+    assert progress.gradient_steps == progress.env_steps - progress.random_steps
+    before, judged = progress.random_steps, iter(expected)
+    kinds = [row["population/surrogate"] for row in generations]
+    assert not kinds[0]  # there was nothing learned yet
+    assert {*kinds} == {False, True}
+    for row, surrogate in zip(generations, kinds, strict=True):
+        made, before = row["env_steps"] - before, row["env_steps"]
+        assert made == (POPULATION * 3 + 10 if surrogate else (POPULATION + 1) * 10)
+        assert row["marl/return"] == 10
+        fitness = [team["fitness"] for team in row["teams"]]
+        if surrogate:
+            values = next(judged)[:POPULATION]
+            np.testing.assert_allclose(fitness, 1 + 1 / 2 + 1 / 4 + values / 8 / 2, rtol=1e-6)
+        else:
+            assert fitness == [10] * POPULATION
+        assert row["operators/mutation_better_rate"] is None
+    assert next(judged, None) is None
+    check_resumption(tmp_path, config)
+
+
+def test_what_is_judged_alike_is_compared() -> None:
+    """Estimates with estimates, returns with returns."""
+    returned = Progress(fitness=(9.0, 11.0), marl_return=10.0)
+    assert returned.selected == "champion"
+    estimated = Progress(fitness=(9.0, 11.0), marl_return=10.0, marl_fitness=12.0)
+    assert estimated.selected == "marl"
+    assert estimated.but(marl_fitness=8.0).selected == "champion"
 
 
 @pytest.mark.parametrize(("owed", "steps"), [(False, 32), (True, 52)])
