@@ -114,6 +114,7 @@ def _card(
         "team": team.name,
         "agent": agent,
         "agents": spec.n_agents,
+        "agent_names": team.agent_names,
         "layer_norm": part.layer_norm,
         "obs": f"as the environment shows it{_normalised(part)}",
         "inputs": {n: {"shape": ["batch", *s], "dtype": d} for n, (s, d) in inputs.items()},

@@ -46,6 +46,12 @@ class Team:
         """The sizes of its task, and who sees and moves what."""
         return self.trained.task.spec
 
+    @property
+    def agent_names(self) -> list[str] | None:
+        """What the task calls its agents, in their order; None if they have only numbers."""
+        names = dict(self.trained.task.facts).get("agent_names")
+        return None if names is None else list(names)
+
     def reset(self) -> None:
         """Forgets the episode. Teams with continuous actions have nothing to forget."""
         self._memory = None
@@ -61,8 +67,10 @@ class Team:
 
         Args:
             obs: what the agents observe: an array [N, O], padded to the largest agent; or one
-                array of its own size per agent, in a list or in a dictionary in their order.
-                Several environments at once have a leading axis: [B, N, O].
+                array of its own size per agent, in a list or in a dictionary. It is by the agents'
+                names where the task has such (`agent_names`), whatever its order, and may hold the
+                task's other agents too; elsewhere it is in the agents' order. Several environments
+                at once have a leading axis: [B, N, O].
             avail_actions: of discrete actions, which each agent can choose, [N, A] or [B, N, A],
                 as 1 and 0. None: all.
             state: instead of ``obs``, the global state [S] or [B, S] of a task with continuous
@@ -143,7 +151,7 @@ class Team:
         spec = self.spec
         sizes = spec.obs_sizes if isinstance(spec, EnvSpec) else (spec.obs_size,) * spec.n_agents
         if isinstance(obs, Mapping):
-            obs = list(obs.values())
+            obs = self._in_order(obs)
         if isinstance(obs, list | tuple) and len(obs) == spec.n_agents:
             each = [_numbers(one, (s,), f"obs of agent {i}") for i, (one, s) in _of(obs, sizes)]
             if len({one.shape[:-1] for one in each}) == 1:
@@ -151,12 +159,31 @@ class Team:
                 for i, one in enumerate(each):
                     seen[..., i, : one.shape[-1]] = one
                 return seen
-        if isinstance(spec, EnvSpec) and np.shape(obs) == (spec.state_size,):
+        shape = (spec.n_agents, spec.obs_size)
+        array = _array(obs, shape, "obs")
+        if isinstance(spec, EnvSpec) and array.shape == (spec.state_size,):
             raise HandedOverError(
                 f"obs has shape [{spec.state_size}], as the global state has, but must be what "
-                f"each agent observes, [{spec.n_agents}, {spec.obs_size}]. Give it as state=."
+                f"each agent observes, {list(shape)}. Give it as state=."
             )
-        return _numbers(obs, (spec.n_agents, spec.obs_size), "obs")
+        return _numbers(array, shape, "obs")
+
+    def _in_order(self, obs: Mapping[Any, Any]) -> list[Any]:
+        names = self.agent_names
+        if names is None:
+            return list(obs.values())
+        by_name = {str(agent): seen for agent, seen in obs.items()}
+        others = dict(self.trained.task.facts).get("other_agents", ())
+        missing = [name for name in names if name not in by_name]
+        strange = [name for name in by_name if name not in (*names, *others)]
+        if missing or strange:
+            wrong = [f"lacks {', '.join(missing)}"] if missing else []
+            wrong += [f"has {', '.join(strange)}"] if strange else []
+            raise HandedOverError(
+                f"obs {' and '.join(wrong)}: the agents of the team are {', '.join(names)}. One "
+                "that is not there observes zeros."
+            )
+        return [by_name[name] for name in names]
 
 
 def _of(obs: Any, sizes: tuple[int, ...]) -> Any:
@@ -165,10 +192,7 @@ def _of(obs: Any, sizes: tuple[int, ...]) -> Any:
 
 def _numbers(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float32]:
     """Numbers as float32, with at most one axis before those of ``shape``."""
-    try:
-        array = np.asarray(value)
-    except ValueError as error:  # lists of unequal lengths
-        raise HandedOverError(f"{name} is no array of shape {list(shape)}: {error}.") from error
+    array = _array(value, shape, name)
     if array.dtype.kind not in "buif":
         raise HandedOverError(f"{name} is of type {array.dtype}, but must be numbers.")
     if array.shape[-len(shape) :] != shape or array.ndim > len(shape) + 1 or array.size == 0:
@@ -182,8 +206,15 @@ def _numbers(value: Any, shape: tuple[int, ...], name: str) -> NDArray[np.float3
     return array.astype(np.float32)
 
 
+def _array(value: Any, shape: tuple[int, ...], name: str) -> NDArray[Any]:
+    try:
+        return np.asarray(value)
+    except ValueError as error:  # lists of unequal lengths
+        raise HandedOverError(f"{name} is no array of shape {list(shape)}: {error}.") from error
+
+
 def _mask(value: Any, leading: tuple[int, ...], n_actions: int) -> NDArray[np.bool_]:
-    array = np.asarray(value)
+    array = _array(value, (*leading, n_actions), "avail_actions")
     if array.shape != (*leading, n_actions) or not ((array == 0) | (array == 1)).all():
         raise HandedOverError(
             f"avail_actions must be 1 and 0 of shape {[*leading, n_actions]}, as obs says; it has "

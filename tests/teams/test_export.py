@@ -64,10 +64,15 @@ class World(gymnasium.Env[Any, Any]):
         return self._seen(), 0.0, False, self._steps == 4, {}
 
 
+NAMES = ["left", "right"]
+
+
 def team_of(form: str) -> Team:
     if form in FORMS:
         made, spec = continuous(form), CONTINUOUS
-        return Team(trained_of(*made, spec, lambda mode: World(spec)), "marl")
+        trained = trained_of(*made, spec, lambda mode: World(spec))
+        task = trained.task._replace(facts=(("agent_names", NAMES),))
+        return Team(trained._replace(task=task), "marl")
     return Team(trained_of(*discrete(form), DISCRETE, lambda mode: World(DISCRETE)), "marl")
 
 
@@ -85,6 +90,7 @@ def test_a_file_acts_as_the_team_does(form: str, ending: str, tmp_path: Path) ->
     card = json.loads(file.card.read_text())
     assert card["sha256"] == hashlib.sha256(out.read_bytes()).hexdigest()
     assert card["checked"]["real_observations"] == 4
+    assert card["agent_names"] == (NAMES if form in FORMS else None)
     assert card["inputs"]["obs"]["shape"] == ["batch", team.spec.n_agents, team.spec.obs_size]
     if form in FORMS:
         np.testing.assert_allclose(card["action_high"], CONTINUOUS.action_high)

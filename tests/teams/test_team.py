@@ -64,6 +64,27 @@ def test_observations_in_any_form_are_the_same(team: Team) -> None:
     np.testing.assert_allclose(team.act(batched), together, atol=2e-6)
 
 
+def test_agents_with_names_are_told_apart_by_them(team: Team) -> None:
+    """Not by the order of a dictionary, which is the environment's affair."""
+    facts = (("agent_names", ["left", "7"]), ("other_agents", ["rival"]))
+    task = team.trained.task
+    named = Team(team.trained._replace(task=task._replace(facts=facts)), "marl")
+    assert (named.agent_names, team.agent_names) == (["left", "7"], None)
+    state = np.random.default_rng(5).normal(size=4).astype(np.float32)
+    left, right = (state[list(agent)] for agent in CONTINUOUS.obs_index)
+    expected = team.act(state=state)
+    for form in ({"left": left, 7: right}, {7: right, "rival": np.zeros(9), "left": left}):
+        np.testing.assert_array_equal(named.act(form), expected)
+    wrong: dict[Any, Any]
+    for wrong, words in (
+        ({"left": left}, "obs lacks 7: the agents of the team are left, 7"),
+        ({"left": left, "rigth": right}, "obs lacks 7 and has rigth:"),
+        ({"left": left, 7: right, "x": right}, "obs has x:"),
+    ):
+        with pytest.raises(HandedOverError, match=words):
+            named.act(wrong)
+
+
 def test_an_agent_alone_does_what_it_does_in_the_team(team: Team) -> None:
     state = np.random.default_rng(9).normal(size=4).astype(np.float32)
     for agent, own in enumerate(team.split(team.act(state=state))):
@@ -125,6 +146,9 @@ def test_what_no_environment_shows_is_refused(team: Team, recurrent: Team) -> No
         (team, (np.zeros((3, 3)),), {}, "the task says"),
         (team, ([np.zeros(3), np.zeros(3)],), {}, "obs of agent 1 has shape"),
         (team, (nan,), {}, "not finite"),
+        (team, ([np.zeros(3), np.zeros(2), np.zeros(1)],), {}, "obs is no array of shape"),
+        (recurrent, ([np.zeros(5), np.zeros(4)],), {}, "obs is no array of shape"),
+        (recurrent, (np.zeros((3, 5)), [[1], [1, 1]]), {}, "avail_actions is no array of shape"),
         (team, ([["a"] * 3] * 2,), {}, "must be numbers"),
         (team, (np.zeros((2, 3)), np.ones((2, 3))), {}, "leave avail_actions out"),
         (recurrent, (), {"state": np.zeros(6)}, "give obs, not state"),
