@@ -146,6 +146,12 @@ def _starcraft(python: str | None) -> Finding:
 
     looks = {package: starcraft.look(package, python) for package in telling.SOURCES}
     found = {package: look for package, look in looks.items() if look.there}
+    if not found and python is None and "SC2PATH" not in os.environ:
+        return Finding(
+            "StarCraft II",
+            "ok",
+            "not set up; smac/* and smacv2/* alone need it (race doctor --python PYTHON tells how)",
+        )
     if not found:
         where = looks["smac"].python
         return Finding(

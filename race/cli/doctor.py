@@ -14,7 +14,8 @@ class Doctor:
     """
 
     python: str | None = None
-    """The interpreter with SMAC, for smac/* and smacv2/*. None: this one."""
+    """The interpreter with SMAC, for smac/* and smacv2/*, or one to be told what it lacks. None:
+    this one."""
 
 
 def main(arguments: list[str]) -> None:

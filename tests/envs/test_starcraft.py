@@ -24,7 +24,7 @@ from race.config.presets import resolve
 from race.config.settings import Config, EnvConfig
 from race.envs import make_task, starcraft
 from race.envs.checked import CheckedEnv
-from race.envs.starcraft import game, remote, scenarios
+from race.envs.starcraft import game, remote, scenarios, telling
 from race.errors import EnvFailedError, TaskError
 from race.rollouts.discrete import EpisodeRollouts
 from race.rollouts.pool import EnvPool
@@ -171,6 +171,15 @@ def test_scenarios() -> None:
     assert all(scenarios.settings(name) for name in scenarios.NAMES)
     for name in ("terran_0_vs_5", "orc_5_vs_5", "protoss_5_vs_5_", "3m"):
         assert scenarios.settings(name) is None
+
+
+def test_sentences_of_others_end_once() -> None:
+    facts = {"text": "SC2 probably crashed. Check the error log.", "base": "/games"}
+    told = [telling.refusal("smac/2s3z", "python", kind, facts) for kind in ("game", "arguments")]
+    told += [telling.failure(kind, facts) for kind in ("error", "died")]
+    for text in told:
+        assert "error log" in text
+        assert ".." not in text
 
 
 def test_messages_arrive_as_they_were_sent(tmp_path: Path) -> None:

@@ -66,6 +66,7 @@ def refusal(task: str, python: str, kind: str, facts: Mapping[str, Any]) -> str:
         facts: of it.
     """
     package = task.partition("/")[0]
+    facts = _open_ended(facts)
     told = missing(package, python, kind, facts)
     if told:
         return f"Task {task}: {told}"
@@ -90,7 +91,12 @@ def refusal(task: str, python: str, kind: str, facts: Mapping[str, Any]) -> str:
 
 def failure(kind: str, facts: Mapping[str, Any]) -> str:
     """What went wrong in a game."""
-    text = facts.get("text") or "it gave no reason"
+    text = _open_ended(facts).get("text") or "it gave no reason"
     if kind == "died":
         return f"it ended or did not answer ({text})."
     return f"{text}."
+
+
+def _open_ended(facts: Mapping[str, Any]) -> Mapping[str, Any]:
+    """With what others said without its full stop, since a message goes on after it."""
+    return {**facts, "text": facts["text"].rstrip(".")} if facts.get("text") else facts
