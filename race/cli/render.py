@@ -85,7 +85,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
     from race.envs.micro import make
     from race.envs.micro.policies import POLICIES
     from race.envs.micro.recording import play
-    from race.viewing.filming import STEPS_PER_SECOND, of_battle
+    from race.viewing.filming import STEPS_PER_SECOND, is_small, of_battle
 
     use_cache()
     console, policy = streams.console(stderr=True), chosen.policy or "scripted"
@@ -93,7 +93,7 @@ def _render_battle(chosen: Render, out: Path, seconds: float) -> None:
         played = make(chosen.what.removeprefix("micro/"))
         most_steps = math.ceil(seconds * STEPS_PER_SECOND) or None
         recording = play(played, POLICIES[policy], chosen.seed, most_steps)
-    drawn = of_battle(played, recording, policy, small=out.suffix.lower() == ".gif")
+    drawn = of_battle(played, recording, policy, small=is_small(out))
     _write(drawn, f"{policy} policy", out, console)
 
 

@@ -54,7 +54,7 @@ def film(
         RaceError: if it cannot be played or drawn.
     """
     named = LABELS[trained.resolve(team)]
-    small = out.suffix.lower() == ".gif"
+    small = is_small(out)
     size = framing.SMALL if small else framing.LARGE
     if isinstance(trained.task, Task):
         chosen = choose_renderer() if renderer is None else renderer
@@ -75,6 +75,11 @@ def film(
             size,
         )
     )
+
+
+def is_small(out: Path) -> bool:
+    """Whether a file is drawn small: as a .gif, which would grow too large."""
+    return out.suffix.lower() == ".gif"
 
 
 def write(
