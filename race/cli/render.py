@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -45,9 +45,12 @@ class Render:
     them); best: the best tested of these."""
     policy: Annotated[
         PolicyName | None,
-        tyro.conf.arg(metavar="{scripted,random}", help_behavior_hint="(default: scripted)"),
+        tyro.conf.arg(
+            metavar="{scripted,random,nearest,heuristic}", help_behavior_hint="(default: scripted)"
+        ),
     ] = None
-    """For a battle: all attack the weakest enemy in reach, or do anything that is available."""
+    """For a battle: all attack the weakest enemy in reach; do anything that is available; attack
+    the nearest, as enemies do; or fight as SMAC's heuristic mode does."""
     seed: int = 0
     """Seed of the episode."""
     seconds: Annotated[

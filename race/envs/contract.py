@@ -21,6 +21,9 @@ from race.types import LARGEST, DiscreteSpec, EnvSpec, Observation
 Seen = Float32[np.ndarray, "S"] | Observation
 """What an environment shows: the state, or a moment of a task with discrete actions."""
 
+NEVER_IDLE: Final = (
+    "Give every agent one that does nothing, also when it is dead and after the last step"
+)
 _NUMBERS: Final = "buif"  # kinds of numpy's types that are real numbers
 
 
@@ -193,10 +196,7 @@ def refuse_idle(avail_actions: Bool[np.ndarray, "N A"]) -> None:
     """
     offered = avail_actions.any(axis=1)
     if not offered.all():
-        raise HandedOverError(
-            f"no action is available to agent {offered.argmin()}. Give every agent one that does "
-            "nothing, also when it is dead and after the last step"
-        )
+        raise HandedOverError(f"no action is available to agent {offered.argmin()}. {NEVER_IDLE}")
 
 
 @final

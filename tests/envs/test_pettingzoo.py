@@ -297,6 +297,20 @@ def test_the_others_act_by_a_function() -> None:
     assert [step.reward for step in steps] == [1, 0]
 
 
+def three(agent: Any, observation: Any, space: Any) -> Any:
+    raise AssertionError
+
+
+def test_functions_for_others_that_cannot_act() -> None:
+    for agents, name, message in (
+        ("cat_*", "three", "three takes other arguments"),
+        ("*", "scripted", "scripted has no effect: all agents are the team.*cat_0.*mouse"),
+    ):
+        config = EnvConfig(agents=agents, others=f"{__name__}:{name}")
+        with pytest.raises(TaskError, match=message):
+            parallel_task(games.Rivals, "mine", config)
+
+
 def test_rivals_are_told_apart() -> None:
     trial = try_out(parallel_task(games.Rivals))
     assert trial.conflict == ("cat_0", "mouse")
@@ -427,7 +441,7 @@ def test_masks_that_are_none() -> None:
         (np.ones(3), r"action_mask with the action space of big has shape \(3,\)"),
         ((np.ones(2), np.ones(4)), r"part 1 of the action_mask .* has shape \(4,\)"),
         (np.array([1, 2, 1, 1, 1]), "has the entry 2"),
-        (np.zeros(5), "no action is available to agent 0"),
+        (np.zeros(5), r"the action_mask with the action space of big leaves no action\..*_games"),
     ):
         Wrong.mask = mask
         with pytest.raises(HandedOverError, match=message):
@@ -549,6 +563,7 @@ def test_names() -> None:
         ("pettingzoo:no_such.thing", "there is no module no_such"),
         (f"{NAMES}.Nubmers", "pettingzoo_games has no Nubmers. The nearest are .*Numbers"),
         (f"{NAMES}.LIMIT", "LIMIT has no function parallel_env"),
+        ("pettingzoo:mpe2.simple_spread", "Did you mean mpe2.simple_spread_v3?"),
         ("pettingzoo:mpe2", "Its modules are .*simple_spread_v3"),
         ("pettingzoo:pettingzoo.mpe.simple_v3", "have moved: pip install mpe2"),
         ("pettingzoo:pettingzoo.sisl.pursuit_v1", "pursuit_v1"),

@@ -15,6 +15,7 @@ from gymnasium import spaces
 
 from race import loading
 from race.config.settings import EnvConfig
+from race.envs.checked import takes
 from race.envs.members import picked
 from race.envs.pettingzoo import source
 from race.envs.pettingzoo.environment import TeamEnv
@@ -172,6 +173,18 @@ def _parallel(env: Any, config: EnvConfig) -> Parallel:
             "Define one that takes (agent, observation, action_space, random) and returns an "
             "action.",
         )
+        if not takes(other, None, None, None, None):
+            raise TaskError(
+                f"--env.others {config.others} takes other arguments: let it be a function of "
+                "(agent, observation, action_space, random) that returns an action."
+            )
     found = source.opened(env)
     team = functools.partial(picked, patterns=config.agents)
-    return Parallel(found.env, team, other, turns=found.turns)
+    parallel = Parallel(found.env, team, other, turns=found.turns)
+    if other is not None and not parallel.others:
+        raise TaskError(
+            f"--env.others {config.others} has no effect: all agents are the team. Pick those that "
+            f"are with --env.agents, out of {', '.join(map(str, parallel.agents))}, or leave it "
+            "out."
+        )
+    return parallel

@@ -139,8 +139,8 @@ class Parallel:
         self._choosing = set(self._present)
         if not self._present & set(self.team):
             raise HandedOverError(
-                f"no agent of the team ({_listed(self.team)}) is in agents after reset, which "
-                f"are {_listed(self._living())}. Let reset set self.agents"
+                f"no agent of the team ({_listed(self.team)}) is in agents after reset, only "
+                f"{_listed(self._living()) or 'nobody'}. Let reset set self.agents"
             )
         self._refuse_unseen()
 

@@ -8,6 +8,8 @@ import inspect
 import json
 import os
 import pkgutil
+import re
+import sys
 from collections.abc import Callable, Iterator
 from typing import Any, Final, NamedTuple
 
@@ -50,9 +52,10 @@ def maker(name: str) -> Callable[..., Any]:
     if made:
         maker_: Callable[..., Any] = made[0]
         return maker_
-    inside = sorted(info.name for info in pkgutil.iter_modules(getattr(found, "__path__", [])))
-    shown = [module for module in inside if not module.startswith("_")]
+    shown = [module for module in _modules(found) if not module.startswith("_")]
     hint = f" Its modules are {', '.join(shown)}." if shown else ""
+    if versions := _versions(name):
+        hint = f" Did you mean {' or '.join(versions)}?"
     raise TaskError(
         f"Task {PREFIX}{name}: {name} has no function parallel_env (or env). Name a module that "
         f"has, or a function or class that makes the environment.{hint}"
@@ -182,13 +185,21 @@ def _found(name: str) -> Any:
         raise TaskError(f"{error} {_advice(name)}".strip()) from error
     with contextlib.suppress(AttributeError, ImportError):
         return getattr(module, last)
-    offered = sorted(
-        {info.name for info in pkgutil.iter_modules(getattr(module, "__path__", []))}
-        | {key for key in vars(module) if not key.startswith("_")}
-    )
+    offered = sorted({*_modules(module), *(key for key in vars(module) if not key.startswith("_"))})
     near = difflib.get_close_matches(last, offered, n=3, cutoff=0.3)
     hint = f" The nearest are {', '.join(f'{parent}.{one}' for one in near)}." if near else ""
     raise TaskError(f"{where}: {parent} has no {last}.{hint}")
+
+
+def _versions(name: str) -> list[str]:
+    """The same name with a version behind it, as PettingZoo's environments have: ``NAME_v3``."""
+    parent, _, last = name.rpartition(".")
+    found = _modules(sys.modules.get(parent))
+    return [f"{parent}.{one}" for one in found if re.fullmatch(rf"{last}_v\d+", one)]
+
+
+def _modules(package: Any) -> list[str]:
+    return sorted(info.name for info in pkgutil.iter_modules(getattr(package, "__path__", [])))
 
 
 def _advice(name: str) -> str:

@@ -238,9 +238,15 @@ class Choices:
                 them, as `gymnasium.spaces.MultiDiscrete` has it, or all of these in one.
 
         Raises:
-            HandedOverError: for another mask.
+            HandedOverError: for another mask, and for one that leaves nothing.
         """
         whose = f"the {MASK} with {self._whose}"
+        found = self._available(mask, whose)
+        if not found.any():
+            raise HandedOverError(f"{whose} leaves no action. {contract.NEVER_IDLE}")
+        return found
+
+    def _available(self, mask: Any, whose: str) -> Bool[np.ndarray, "A"]:
         if len(self._counts) == 1:
             return contract.mask(mask, (self.count,), whose)
         if isinstance(mask, tuple | list) and len(mask) == len(self._counts):
