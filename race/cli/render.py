@@ -46,7 +46,8 @@ class Render:
     policy: Annotated[
         PolicyName | None,
         tyro.conf.arg(
-            metavar="{scripted,random,nearest,heuristic}", help_behavior_hint="(default: scripted)"
+            metavar=f"{{{','.join(get_args(PolicyName))}}}",
+            help_behavior_hint="(default: scripted)",
         ),
     ] = None
     """For a battle: all attack the weakest enemy in reach; do anything that is available; attack
