@@ -211,7 +211,12 @@ def test_settings_of_a_run_train_it_again(run: race.Run, tmp_path: Path) -> None
         ({"task": "probe/targt"}, "probe/target"),
         ({"task": "probe/target", "lerner": {}}, "Did you mean learner"),
         ({"task": "probe/target", "learner": {"batch": 3}}, "batch_size"),
-        ({"task": "probe/target", "seed": "1"}, "seed is '1'"),
+        ({"task": "probe/target", "seed": "1"}, "seed is '1', but must be a whole number"),
+        ({"task": "probe/target", "base": "td3"}, "must be one of 'matd3', .* or None"),
+        (
+            {"task": "probe/target", "learner": {"hidden_sizes": [8]}},
+            r"must be a list of 2: a whole number, a whole number",
+        ),
         ({"task": "probe/target", "algo": "matd3", "race": {"population_size": 3}}, "no effect"),
         ({"task": "probe/target", "config": "nothing.toml"}, "cannot be read"),
         ({"task": "probe/target", "log": ("paper",)}, "tensorboard.*not 'paper'"),

@@ -10,7 +10,7 @@ import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from race.config.ablations import ABLATIONS, ablated
 from race.config.effects import setting
 from race.config.grid import GROUPS, TOP, exact, refuse_unknown
 from race.config.presets import PRESETS, filled
-from race.config.settings import Config, LearnerConfig, Preset, fits, from_json, tupled
+from race.config.settings import Config, LearnerConfig, Preset, fits, from_json, told, tupled
 from race.errors import ConfigError
 
 _ALONE = ("preset", "ablation")
@@ -127,9 +127,7 @@ def _value(name: str, value: Any, hint: Any) -> Any:
     if isinstance(alone, np.generic):
         alone = alone.item()
     if not fits(alone, hint):
-        choices = [repr(one) for one in get_args(hint) if get_origin(hint) is Literal]
-        which = f"it is one of {', '.join(choices)}" if choices else "which it cannot be"
-        raise ConfigError(f"{name} is {value!r}{': ' if choices else ', '}{which}.")
+        raise ConfigError(f"{name} is {value!r}, but must be {told(hint)}.")
     return exact(alone, hint)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from race.config.ablations import ABLATIONS
 from race.config.presets import PRESETS
 from race.config.seeds import parse_seeds
-from race.config.settings import Config, fits, from_json, to_json, tupled
+from race.config.settings import Config, fits, from_json, to_json, told, tupled
 from race.errors import ConfigError
 
 GROUPS = ("learner", "facmac", "race", "env", "evaluation", "checkpoint", "compute")
@@ -173,11 +173,13 @@ def _axis(name: str, value: Any, hint: Any, draws: int | None) -> Axis:
         choices = tuple(map(tupled, value))
         for choice in choices:
             if not fits(choice, hint):
-                raise ConfigError(f"{name} has {choice!r} among its values, which it cannot be.")
+                raise ConfigError(
+                    f"{name} has {choice!r} among its values, but each must be {told(hint)}."
+                )
         if len(set(map(repr, choices))) < len(choices):
             raise ConfigError(f"{name} names a value twice: {value!r}.")
         return Axis(name, tuple(exact(choice, hint) for choice in choices))
-    raise ConfigError(f"{name} is {value!r}, which it cannot be.")
+    raise ConfigError(f"{name} is {value!r}, but must be {told(hint)}, or a list of such.")
 
 
 def exact(value: Any, hint: Any) -> Any:

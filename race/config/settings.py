@@ -7,7 +7,7 @@ run and read back by every other command, so a run directory explains itself.
 import dataclasses
 from dataclasses import dataclass, field
 from types import UnionType
-from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
@@ -497,3 +497,20 @@ def fits(value: Any, hint: Any) -> bool:
     if hint is float:
         return isinstance(value, int | float) and not isinstance(value, bool)
     return type(value) is (hint or type(None))
+
+
+def told(hint: Any) -> str:
+    """What values `fits` takes for a type, in words."""
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is Literal:
+        return f"one of {', '.join(map(repr, arguments))}"
+    if origin in (UnionType, Union):
+        return " or ".join(map(told, arguments))
+    if origin is tuple and arguments[-1] is Ellipsis:
+        return f"a list, each of it {told(arguments[0])}"
+    if origin is tuple:
+        return f"a list of {len(arguments)}: {', '.join(map(told, arguments))}"
+    return _WORDS.get(hint, "None")
+
+
+_WORDS: Final = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
