@@ -1,5 +1,6 @@
 """Every command that the README and the documents show runs, in their order, at a small size."""
 
+import dataclasses
 import importlib
 import json
 import re
@@ -11,6 +12,10 @@ from typing import Any
 import pytest
 
 from race.cli import COMMANDS, main
+from race.cli.train import _parse
+from race.config.ablations import ablated
+from race.config.presets import resolve
+from race.config.settings import Config
 from race.envs import make_task
 from race.types import DiscreteTask
 
@@ -113,6 +118,23 @@ def test_commands_in_documents_run(
         # It reads a run of these commands.
         if 'race.load("runs/battle' in example or document in TUTORIALS:
             exec(example, {})
+
+
+def test_lengths_of_training_in_documents_are_possible() -> None:
+    """As they stand: where commands are run, they are made smaller."""
+    checked = 0
+    for document in DOCUMENTS:
+        for block in re.findall(r"```(?:sh)?\n(.*?)```", document.read_text(), re.DOTALL):
+            for line in block.replace("\\\n", " ").splitlines():
+                if not line.startswith("race train ") or "--env-steps" not in line:
+                    continue
+                chosen = _parse(shlex.split(line.split("  #")[0])[2:])
+                fields = {field.name for field in dataclasses.fields(Config)}
+                asked = Config(**{n: v for n, v in vars(chosen).items() if n in fields})
+                discrete = asked.task.startswith(("micro/", "smac"))
+                resolve(ablated(asked, chosen.ablation, discrete), discrete=discrete)
+                checked += 1
+    assert checked > 6
 
 
 @pytest.mark.slow
