@@ -9,6 +9,7 @@ import contextlib
 import difflib
 import functools
 import io
+import os
 import re
 import sys
 import tempfile
@@ -307,7 +308,9 @@ def _spec(
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """Loads the library and keeps back what third parties say of it that is known as harmless."""
-    with blamed(TaskError, "mujoco cannot be imported, which Multi-Agent MuJoCo runs on"):
+    asked = os.environ.get("MUJOCO_GL")
+    why = f" (MUJOCO_GL is {asked!r}; without it, it may be)" if asked else ""
+    with blamed(TaskError, f"mujoco cannot be imported, which Multi-Agent MuJoCo runs on{why}"):
         import mujoco
 
     def warn(message: str) -> None:

@@ -28,6 +28,8 @@ Policy = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 PACKAGES = "apt-get install -y libegl1 libgl1-mesa-dri"
 """What gives a Debian or Ubuntu machine OpenGL without a display."""
 
+_NONE = "disabled"
+"""With a backend that it cannot load, or a word that it does not know, mujoco is not imported."""
 _MOST_FRAMES_PER_SECOND = 30.0
 _PROBE = """
 import mujoco
@@ -64,12 +66,13 @@ def choose_renderer() -> Renderer:
     asked = os.environ.get("MUJOCO_GL", "").lower()
     candidates = [b for b in get_args(Backend)[:-1] if b == asked] if asked else offered
     if not candidates:
-        os.environ["MUJOCO_GL"] = "disabled"  # with a word that it does not know, mujoco is none
+        os.environ["MUJOCO_GL"] = _NONE
         return Renderer("sketch", f"the built-in renderer, because MUJOCO_GL is {asked!r}")
     for candidate in candidates:
         if _draws(candidate):
             os.environ["MUJOCO_GL"] = candidate
             return Renderer(candidate, f"OpenGL through {candidate}")
+    os.environ["MUJOCO_GL"] = _NONE
     return Renderer(
         "sketch",
         f"no OpenGL ({', '.join(candidates)} tried), so the slower built-in renderer draws; "

@@ -1,5 +1,6 @@
 import contextlib
 import io
+import sys
 import warnings
 
 import mujoco
@@ -8,7 +9,7 @@ import pytest
 
 from race.config.settings import EnvConfig
 from race.envs import make_task
-from race.envs.mamujoco import KNOWN_PARTITIONS
+from race.envs.mamujoco import KNOWN_PARTITIONS, quiet
 from race.errors import ConfigError, TaskError
 
 LIBRARY = EnvConfig(library_observation=True)
@@ -248,3 +249,15 @@ def test_segments_of_the_long_ant_see_their_neighbours_hips():
         segment, is_hip = actuator // 4, actuator % 2 == 0
         near = {segment - 1, segment, segment + 1} & set(range(4)) if is_hip else {segment}
         assert position == velocity == near, actuator
+
+
+def test_a_mujoco_that_is_not_imported_is_told_with_what_was_asked_of_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    with pytest.raises(TaskError, match=r"runs on \(MUJOCO_GL is 'osmesa'"), quiet():
+        pass
+    monkeypatch.delenv("MUJOCO_GL")
+    with pytest.raises(TaskError, match="runs on: "), quiet():
+        pass

@@ -1,6 +1,7 @@
 """Videos: what draws, what is drawn, and the files."""
 
 import gc
+import os
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -48,6 +49,8 @@ def test_the_renderer_is_the_first_that_draws(
     fresh_choice.setenv("MUJOCO_GL", asked)
     fresh_choice.setattr(rendering, "_draws", lambda backend: backend in working)
     assert choose_renderer().backend == expected
+    # What does not draw may not even be imported by mujoco.
+    assert os.environ["MUJOCO_GL"] == ("disabled" if expected == "sketch" else expected)
 
 
 def test_a_renderer_that_crashes_or_hangs_does_not_draw(fresh_choice: pytest.MonkeyPatch) -> None:
@@ -59,6 +62,7 @@ def test_a_renderer_that_crashes_or_hangs_does_not_draw(fresh_choice: pytest.Mon
 
     for broken in (crash, hang):
         choose_renderer.cache_clear()
+        fresh_choice.setenv("MUJOCO_GL", "")
         fresh_choice.setattr(subprocess, "run", broken)
         chosen = choose_renderer()
         assert chosen.backend == "sketch"
