@@ -11,7 +11,8 @@ import pytest
 from race.compilation import DETERMINISTIC, use_cache
 from race.config.compute import ComputeConfig
 from race.config.presets import resolve
-from race.config.settings import Config, from_json, to_json
+from race.config.saved import from_json, to_json
+from race.config.settings import Config
 from race.training.cohort import kind_of
 
 

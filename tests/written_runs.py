@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from race.config import settings as configs
+from race.config import saved as configs
 from race.config.presets import resolve
 from race.config.settings import Config
 

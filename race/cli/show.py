@@ -30,7 +30,7 @@ class Show:
 def main(arguments: list[str]) -> None:
     """Parses the arguments, reads and prints."""
     chosen = tyro.cli(Show, args=arguments, prog="race show")
-    from race.config import settings
+    from race.config.saved import to_json
     from race.envs.own import is_own
     from race.errors import ConfigError, command
     from race.runs import checkpoints
@@ -53,7 +53,7 @@ def main(arguments: list[str]) -> None:
         "finished": run_directory.is_finished(chosen.run_dir),
         "checkpoints": [path.name for path in saved],
         "best": best,
-        "config": settings.to_json(config),
+        "config": to_json(config),
         "metadata": origin,
         "rows": found.rows[len(found.rows) - min(chosen.rows, len(found.rows)) :],
     }

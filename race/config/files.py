@@ -18,7 +18,8 @@ from race.config.ablations import ABLATIONS, ablated
 from race.config.effects import setting
 from race.config.grid import GROUPS, TOP, exact, refuse_unknown
 from race.config.presets import PRESETS, filled
-from race.config.settings import Config, LearnerConfig, Preset, fits, from_json, told, tupled
+from race.config.saved import fits, from_json, told, tupled
+from race.config.settings import Config, LearnerConfig, Preset
 from race.errors import ConfigError
 
 _ALONE = ("preset", "ablation")

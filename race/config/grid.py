@@ -15,8 +15,9 @@ import numpy as np
 
 from race.config.ablations import ABLATIONS
 from race.config.presets import PRESETS
+from race.config.saved import fits, from_json, to_json, told, tupled
 from race.config.seeds import parse_seeds
-from race.config.settings import Config, fits, from_json, to_json, told, tupled
+from race.config.settings import Config
 from race.errors import ConfigError
 
 GROUPS = ("learner", "facmac", "race", "env", "evaluation", "checkpoint", "compute")

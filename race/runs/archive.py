@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from race.config import settings as configs
+from race.config import saved as configs
 from race.config.presets import resolve
 from race.errors import ConfigError, RunDirectoryError
 from race.runs.recorded import Recorded

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from race.config import settings as configs
+from race.config import saved as configs
 from race.config.presets import resolve
 from race.config.settings import Config
 from race.errors import ConfigError, RunDirectoryError, command

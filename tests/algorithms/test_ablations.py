@@ -35,7 +35,8 @@ from race.algorithms.population import inject_team
 from race.config.ablations import ABLATIONS, ablated, told_by_name
 from race.config.hyper import Hyper, hyper_of
 from race.config.presets import resolve
-from race.config.settings import Config, RaceConfig, to_json
+from race.config.saved import to_json
+from race.config.settings import Config, RaceConfig
 from race.config.shape import shape_of
 from race.errors import ConfigError
 from race.types import EnvSpec

@@ -12,7 +12,8 @@ from race.cli.train import Train, _parse
 from race.config.ablations import ablated
 from race.config.files import Wanted, of_mapping, of_record, read_wanted
 from race.config.presets import PRESETS, filled
-from race.config.settings import Config, LearnerConfig, RaceConfig, to_json
+from race.config.saved import to_json
+from race.config.settings import Config, LearnerConfig, RaceConfig
 from race.envs import make_task
 from race.errors import ConfigError
 from race.training.asking import settled_with_file

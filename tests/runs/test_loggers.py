@@ -11,7 +11,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from race.config import settings as configs
+from race.config import saved as configs
 from race.config.presets import resolve
 from race.config.settings import Config
 from race.errors import ConfigError

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from race.config import settings as configs
+from race.config import saved as configs
 from race.config.settings import Config
 
 PROJECT = "race"
