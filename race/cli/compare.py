@@ -20,8 +20,8 @@ class Compare:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR...")]
     """Run directories, folders that hold some, or archives (`race archive`)."""
     base: str | None = None
-    """The method that others are measured against, by its name in the table. By default the
-    gradient learner alone, such as MATD3."""
+    """The method that others are measured against, by its name in the table. By default, on each
+    task, the gradient learner alone that its methods are built on, such as MATD3."""
     metric: str = "auto"
     """Quantity of the tests: return_mean, win_rate, length_mean. auto: win_rate where there are
     wins to be had, else return_mean."""
