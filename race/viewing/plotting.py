@@ -1,8 +1,9 @@
 """Figures of learning curves: runs of one method together, one panel per task."""
 
+import itertools
 import math
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -42,7 +43,10 @@ _DISCRETE_COLOURS = {
     **{"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"},
     **{"MERL(FACMAC)": "#1f77b4", "EA": "#2ca02c"},
 }
-_OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#17becf", "#bcbd22")
+_OTHER_COLOURS = (
+    *("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#7f7f7f", "#e6ab02", "#1b4f9c", "#a6d96a"),
+    *("#c51b7d", "#66c2a5", "#b15928", "#fb9a99"),
+)
 _AXES = {"return_mean": "test return", "win_rate": "test win rate"}
 _LINES = {"selected": "-", "marl": "--", "champion": ":", "best": "-."}
 
@@ -192,16 +196,20 @@ def colours_of(names: Sequence[str]) -> dict[str, str]:
 def _colours(methods: Methods) -> dict[tuple[str, str], str]:
     """A colour for each method, and for each of several experiments with one method."""
     known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
-    spare: Iterator[str] = iter(_OTHER_COLOURS * 20)
-    taken: dict[tuple[str, str], str] = {}
-    for method, name in sorted(methods, reverse=True):
-        experiment = name.rsplit(", ", 1)[0] if name.endswith(tuple(LABELS.values())) else name
-        if (method, experiment) not in taken:
-            own = known.get(method)
-            free = own is not None and own not in taken.values()
-            taken[method, experiment] = str(own) if free else next(spare)
-        taken[method, name] = taken[method, experiment]
-    return taken
+    all_of = dict.fromkeys((m, _experiment(name)) for m, name in sorted(methods, reverse=True))
+    own: dict[str, tuple[str, str]] = {}  # whose colour it is
+    for method, experiment in all_of:
+        if method in known:
+            own.setdefault(known[method], (method, experiment))
+    colours = {of: colour for colour, of in own.items()}
+    spare = itertools.cycle([colour for colour in _OTHER_COLOURS if colour not in own])
+    colours |= {of: next(spare) for of in all_of if of not in colours}
+    return {(method, name): colours[method, _experiment(name)] for method, name in methods}
+
+
+def _experiment(name: str) -> str:
+    """A curve's name without whose tests it shows."""
+    return name.rsplit(", ", 1)[0] if name.endswith(tuple(LABELS.values())) else name
 
 
 def wrapped(name: str) -> str:

@@ -274,3 +274,11 @@ def test_long_names_stay_on_the_picture(tmp_path: Path, monkeypatch: pytest.Monk
     assert whole.x0 <= box.x0 < box.x1 <= whole.x1
     assert whole.y0 - 4 <= box.y0  # nothing but the margin below the last line
     assert axes.get_window_extent().height > 2.5 * figure.dpi  # inches
+
+
+def test_a_dozen_curves_have_colours_of_their_own() -> None:
+    names = [f"RACE(MATD3) race.mutation_fraction={k / 10}" for k in range(8)]
+    found = plotting.colours_of(["EA", "MATD3", "MERL(MATD3)", "FACMAC", *names])
+    assert len(set(found.values())) == 12
+    assert (found["EA"], found["MATD3"]) == ("#2ca02c", "#222222")  # the paper's
+    assert "#d62728" in {found[name] for name in names}
