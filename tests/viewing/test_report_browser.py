@@ -254,10 +254,23 @@ def test_a_watched_page_loads_itself_again(browser: Any, tmp_path: Path) -> None
         thread = threading.Thread(target=serving.serve_forever, daemon=True)
         thread.start()
         window = Window(browser, f"http://127.0.0.1:{serving.server_port}/")
-        with (runs / "metrics.jsonl").open("a") as file:
-            row = {"kind": "evaluation", "env_steps": 200, "eval/selected/return_mean": 2.0}
-            file.write(json.dumps(row | {"wall_seconds": 20.0}) + "\n")
-        window.wait("document.querySelector('#curves .chart')?.data?.some(t => t.x.length === 2)")
+        points = "document.querySelector('#curves .chart')?.data?.[0].x.length"
+
+        def write(steps: int) -> None:
+            with (runs / "metrics.jsonl").open("a") as file:
+                row = {"kind": "evaluation", "env_steps": steps, "eval/selected/return_mean": 2.0}
+                file.write(json.dumps(row | {"wall_seconds": 20.0}) + "\n")
+
+        write(200)
+        window.wait(f"{points} === 2")
+        # Not under the hands of somebody.
+        window.page.keyboard.press("Tab")
+        write(300)
+        for _ in range(8):
+            time.sleep(0.5)
+            assert window.page.evaluate(f"{points} === 2")
+            window.page.keyboard.press("Tab")
+        window.wait(f"{points} === 3")
         assert window.said == []
         assert {url.rpartition("/")[2] for url in window.asked} <= {"", "fingerprint"}
         serving.shutdown()

@@ -253,7 +253,12 @@
   }
   function watch() {
     const known = document.body.dataset.watched;
-    if (known) setInterval(async () => {
+    if (!known) return;
+    let touched = 0; // when somebody last did something: what is being looked at is not taken away
+    for (const kind of ["pointerdown", "keydown", "wheel"]) addEventListener(kind, () => { touched = Date.now(); }, { passive: true });
+    const busy = () => Date.now() - touched < 8000 || (fought && fought.player && fought.player.playing()) || [...document.querySelectorAll("video")].some((v) => !v.paused);
+    setInterval(async () => {
+      if (busy()) return;
       try { const now = await (await fetch("fingerprint")).text(); if (now !== known) location.reload(); } catch { /* the server has gone */ }
     }, 3000);
   }
