@@ -531,3 +531,11 @@ def test_a_real_cluster_goes_on_with_a_run(run: Path) -> None:
     assert "Finished after" in (run / "log.txt").read_text()  # said by the process that was sent
     assert rows(run) == before
     assert not list(run.parent.glob(".cluster-*"))
+
+
+def test_lost_metrics_are_not_taken_for_a_young_run(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "metrics.jsonl").unlink()
+    for command in ("compare", "plot"):
+        assert "rows are missing" in fails(f"{command} {run}", capsys)
