@@ -1,5 +1,6 @@
 """``race compare``."""
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -61,6 +62,8 @@ def main(arguments: list[str]) -> None:
     for file in chosen.out:
         if file.suffix not in SUFFIXES:
             raise RaceError(f"{file}: the name must end with {', '.join(SUFFIXES)}.")
+    if chosen.score is not None and not math.isfinite(chosen.score):
+        raise RaceError(f"--score is {chosen.score}, but it must be a number.")
     scores = scores_of(load(chosen.runs), chosen.metric, chosen.team)
     if chosen.strict and scores.differences:
         raise RaceError(

@@ -216,6 +216,7 @@ def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         ([], "Say which runs"),
         ([str(folder), "--out", "c.xlsx"], "must end with"),
         ([str(folder), "--profile", "c.txt"], "must end with"),
+        ([str(folder), "--score", "nan"], "--score is nan"),
         ([str(tmp_path / "nowhere")], "not a directory"),
     ):
         with pytest.raises(SystemExit):
