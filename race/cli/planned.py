@@ -27,7 +27,8 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
             if key not in sizes:
                 sizes[key] = replay_bytes(config)
             there = run_directory.RunDirectory(run.path).config.exists()
-            state = run.ended or ("begun" if there else "new")
+            other = there and run_directory.open_run(run.path) != config
+            state = "other settings" if other else run.ended or ("begun" if there else "new")
             steps, size = f"{config.env_steps:,}", f"{sizes[key] / 1e9:.2f} GB"
             line = f"{run.name:<{longest}}  {number:>7}  {steps:>10}  {size:>7}  {state}"
             console.print(line, soft_wrap=True, highlight=False)
