@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from race.statistics.intervals import Estimate, bounds_of, mean_estimate
-from race.statistics.separation import difference, seeds_needed
+from race.statistics.separation import difference, seeds_needed, surely_apart
 from race.statistics.stratified import (
     UNBOUNDED,
     bootstrap_interval,
@@ -57,7 +57,7 @@ class Pair(NamedTuple):
     base: str
     difference: Estimate
     told_apart: bool | None
-    """None with a single seed of either."""
+    """None with too few seeds to tell."""
     seeds_needed: int | None
     """Of each, where they are not told apart; None: unknown, or more than a thousand."""
 
@@ -233,6 +233,8 @@ def _pair(scores: Scores, task: str, method: str, base: str) -> Pair:
     mine, its = _finals(scores.of(task, method)), _finals(scores.of(task, base))
     found = difference(mine, its)
     apart = None if math.isnan(found.low) else not found.low <= 0.0 <= found.high
+    if found.low == found.high != 0.0 and not surely_apart(len(mine), len(its)):
+        apart = None  # such as win rates that are all alike: Welch's test knows no spread
     return Pair(
         task, method, base, found, apart, seeds_needed(mine, its) if apart is False else None
     )

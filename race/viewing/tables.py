@@ -125,7 +125,7 @@ def _time(row: OnTask) -> str:
 def _pair(pair: Pair | None) -> list[str]:
     if pair is None:
         return [MISSING, MISSING]
-    told = {True: "yes", None: "one seed cannot tell"}.get(pair.told_apart)
+    told = {True: "yes", None: "too few seeds to tell"}.get(pair.told_apart)
     if told is None:
         needed = pair.seeds_needed
         told = f"no: {needed} seeds each" if needed else f"no: over {MOST_SEEDS:,} seeds"

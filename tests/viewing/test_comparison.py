@@ -151,7 +151,7 @@ def test_what_is_unlike_is_said(tmp_path: Path) -> None:
     assert [run.final for run in scores.runs] == [2.0, 2.0, 2.0]
     found = compare(scores)
     assert any("One seed has no interval: MATD3" in note for note in found.notes)
-    assert "one seed cannot tell" in written(found, "text")
+    assert "too few seeds to tell" in written(found, "text")
     with pytest.raises(SystemExit):
         main(["compare", str(tmp_path), "--strict"])
 
@@ -301,3 +301,18 @@ def test_the_gain_of_an_algorithm_is_over_the_base_of_each_task(of_both: Compari
         f"{ANT}; {HOPPER}",
         BATTLE,
     }
+
+
+@pytest.mark.parametrize(("seeds", "apart"), [(2, None), (4, True)])
+def test_seeds_that_are_all_alike_prove_something_only_if_they_are_many(
+    tmp_path: Path, seeds: int, apart: bool | None
+) -> None:
+    """Win rates of 1 and 0.97 have no spread, so that Welch's interval has no width."""
+    for algo, rate in (("race", 1.0), ("facmac", 0.97)):
+        for seed in range(seeds):
+            told = {"task": BATTLE, "algo": algo, "seed": seed}
+            written_run(tmp_path / f"{algo} {seed}", [(9, rate)], None, "win_rate", None, **told)
+    found = compare(scores_of(load([tmp_path])))
+    (pair,) = found.pairs
+    assert (pair.difference.value, pair.told_apart) == (pytest.approx(0.03), apart)
+    assert ("too few seeds to tell" if apart is None else "yes") in written(found, "text")
