@@ -15,6 +15,9 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
     from race.runs import directory as run_directory
 
     console = streams.console()
+    if not runs:  # all of them are known from elsewhere
+        console.print("Nothing is left to run.")
+        return
     watched = [Watched(path / name, config) for name, config in runs.items()]
     groups = crews(watched, cohort.batching, cohort.width, accelerators())
     longest = max(map(len, runs))

@@ -8,6 +8,8 @@ import pytest
 from written_runs import written_run
 
 from race.cli import main
+from race.cli.planned import show_plan
+from race.config.cohort import CohortConfig
 from race.config.presets import TABLES
 from race.config.settings import Config
 from race.envs import make_task
@@ -205,3 +207,8 @@ def test_runs_that_were_made_with_other_settings_are_named(
     told = " ".join(capsys.readouterr().err.split())
     assert "holds a run with other settings (env_steps 1000000, asked: 500000)" in told
     assert "another directory with --dir" in told
+
+
+def test_a_plan_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show_plan(tmp_path, {}, CohortConfig())  # where --known has all runs
+    assert capsys.readouterr().out == "Nothing is left to run.\n"
