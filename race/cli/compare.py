@@ -1,5 +1,6 @@
 """``race compare``."""
 
+import math
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +21,8 @@ class Compare:
     runs: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="DIR...")]
     """Run directories, folders that hold some, or archives (`race archive`)."""
     base: str | None = None
-    """The method that others are measured against, by its name in the table. By default the
-    gradient learner alone, such as MATD3."""
+    """The method that others are measured against, by its name in the table. By default, on each
+    task, the gradient learner alone that its methods are built on, such as MATD3."""
     metric: str = "auto"
     """Quantity of the tests: return_mean, win_rate, length_mean. auto: win_rate where there are
     wins to be had, else return_mean."""
@@ -61,6 +62,8 @@ def main(arguments: list[str]) -> None:
     for file in chosen.out:
         if file.suffix not in SUFFIXES:
             raise RaceError(f"{file}: the name must end with {', '.join(SUFFIXES)}.")
+    if chosen.score is not None and not math.isfinite(chosen.score):
+        raise RaceError(f"--score is {chosen.score}, but it must be a number.")
     scores = scores_of(load(chosen.runs), chosen.metric, chosen.team)
     if chosen.strict and scores.differences:
         raise RaceError(

@@ -15,6 +15,9 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
     from race.runs import directory as run_directory
 
     console = streams.console()
+    if not runs:  # all of them are known from elsewhere
+        console.print("Nothing is left to run.")
+        return
     watched = [Watched(path / name, config) for name, config in runs.items()]
     groups = crews(watched, cohort.batching, cohort.width, accelerators())
     longest = max(map(len, runs))
@@ -27,7 +30,8 @@ def show_plan(path: Path, runs: dict[str, Any], cohort: CohortConfig) -> None:
             if key not in sizes:
                 sizes[key] = replay_bytes(config)
             there = run_directory.RunDirectory(run.path).config.exists()
-            state = run.ended or ("begun" if there else "new")
+            other = there and run_directory.open_run(run.path) != config
+            state = "other settings" if other else run.ended or ("begun" if there else "new")
             steps, size = f"{config.env_steps:,}", f"{sizes[key] / 1e9:.2f} GB"
             line = f"{run.name:<{longest}}  {number:>7}  {steps:>10}  {size:>7}  {state}"
             console.print(line, soft_wrap=True, highlight=False)

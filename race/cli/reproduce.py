@@ -114,12 +114,15 @@ def main(arguments: list[str]) -> None:
         return
     failure = None
     if missing and not chosen.draw_only:
-        create_runs(chosen.dir, missing, chosen.log)
+        create_runs(chosen.dir, missing, chosen.log, "--dir")
         places = [chosen.dir / name for name in missing]
         try:
             run_all(chosen.dir, places, jobs=chosen.jobs, cohort=chosen.cohort, on=chosen.on)
         except RaceError as error:  # what the others did is drawn all the same
             failure = error
+        except SystemExit:
+            print("The same command goes on too, and draws the figures.")
+            raise
     _draw(chosen, figures, made, known)
     if failure is not None:
         raise failure

@@ -1,5 +1,6 @@
 """``race sweep``."""
 
+import dataclasses
 import os
 import re
 import tomllib
@@ -119,8 +120,20 @@ def _name(config: Any, varied: dict[str, Any]) -> str:
     return re.sub(r"[^\w.=+-]+", "_", plain).strip("_")
 
 
-def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -> None:
-    """Makes the run directories that are not there, or none if one that is there is another."""
+def create_runs(
+    path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...], option: str = "--run-dir"
+) -> None:
+    """Makes the run directories that are not there, or none if one that is there is another.
+
+    Args:
+        path: the folder.
+        runs: their configurations by their names.
+        log: who is told of them besides.
+        option: what names the folder.
+
+    Raises:
+        RunDirectoryError: if one that is there has other settings; says which.
+    """
     from race.cli.train import tried
     from race.envs import make_task
     from race.envs.description import describe
@@ -132,10 +145,10 @@ def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -
     for name, config in runs.items():
         if not (path / name / "config.json").exists():
             missing[name] = config
-        elif run_directory.open_run(path / name) != config:
+        elif (there := run_directory.open_run(path / name)) != config:
             raise RunDirectoryError(
-                f"{path / name} holds a run with other settings than the file's. Choose another "
-                f"directory with --run-dir, or go on with the runs as they are: "
+                f"{path / name} holds a run with other settings ({unlike(there, config)}). Choose "
+                f"another directory with {option}, or go on with the runs as they are: "
                 f"{command('race', 'resume', path)}"
             )
     described: dict[Any, Any] = {}
@@ -146,3 +159,15 @@ def create_runs(path: Path, runs: dict[str, Any], log: tuple[LoggerName, ...]) -
             described[key] = describe(task) | tried(config.task, task)
         run_directory.create(path / name, config, described[key])
         choose(path / name, log)
+
+
+def unlike(there: Any, asked: Any) -> str:
+    """The settings in which two runs differ, with both values."""
+    found = []
+    for group, value in dataclasses.asdict(there).items():
+        other = dataclasses.asdict(asked)[group]
+        pairs = {group: (value, other)}
+        if isinstance(value, dict):
+            pairs = {f"{group}.{name}": (value[name], other[name]) for name in value}
+        found += [f"{name} {a}, asked: {b}" for name, (a, b) in pairs.items() if a != b]
+    return "; ".join(found)

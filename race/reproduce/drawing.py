@@ -18,7 +18,7 @@ from race.runs.recorded import Recorded
 from race.statistics.intervals import bounds_of, mean_estimate
 from race.viewing import curves as chosen
 from race.viewing.curves import Curve, aggregate
-from race.viewing.plotting import draw, frame
+from race.viewing.plotting import draw, frame, make_room
 
 _COLOURS = ("#d62728", "#1f77b4", "#222222", "#8c564b", "#2ca02c", "#ff7f0e")
 _RATES = {"elite": "injection/elite_rate", "discarded": "injection/discarded_rate"}
@@ -73,6 +73,7 @@ def draw_figure(
         axes.legend(
             frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.22)
         )
+    make_room(canvas, rows, 4.4)
     told = "; rings: the paper's numbers" if rings else ""
     canvas.suptitle(f"{name}: {figure.title}{told}", fontsize="medium")
     with written_aside(out) as temporary:

@@ -62,6 +62,8 @@ def plan(
     """
     if not 0 < scale <= 10:
         raise ConfigError(f"--scale is {scale:g}, but it must be above 0 and at most 10.")
+    if env_steps is not None and env_steps < 1:
+        raise ConfigError(f"--env-steps is {env_steps}, but it must be at least 1.")
     plain = asked
     if preset != "paper" and asked.learner == PRESETS["paper"]:
         plain = dataclasses.replace(asked, learner=PRESETS[preset])

@@ -40,6 +40,8 @@ def of_directory(path: Path) -> Recorded:
     # Before the rows, which are the newer then and hold all that it knows of.
     kept = checkpoints.metrics_extent(run.checkpoints)
     rows = metrics.read(run.metrics, identity, kept) if run.metrics.exists() else []
+    if kept is not None and not run.metrics.exists():
+        metrics.check_extent(run.metrics, b"", kept)  # none are there yet, or they are lost
     return Recorded(str(path), config, rows, run_directory.read_metadata(path), path)
 
 

@@ -33,6 +33,15 @@ def difference(
     return Estimate(value, float(found.low), float(found.high))
 
 
+def surely_apart(seeds: int, others: int, significance: float = 0.05) -> bool:
+    """Whether two methods are told apart if every seed of the one is better than all of the other.
+
+    By the exact test of permutations (Mann and Whitney, 1947), two-sided: of all ways to draw the
+    seeds two are as extreme. It takes four of each, or five and three.
+    """
+    return 2 / math.comb(seeds + others, seeds) <= significance
+
+
 def seeds_needed(
     method: NDArray[np.float64],
     base: NDArray[np.float64],

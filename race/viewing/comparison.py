@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from race.errors import RaceError
 from race.statistics.intervals import Estimate, bounds_of, mean_estimate
-from race.statistics.separation import difference, seeds_needed
+from race.statistics.separation import difference, seeds_needed, surely_apart
 from race.statistics.stratified import (
     UNBOUNDED,
     bootstrap_interval,
@@ -20,6 +19,7 @@ from race.statistics.stratified import (
     relative_gain,
     share_above,
 )
+from race.viewing.grouping import bases_of, families_of, name_of, pooled
 from race.viewing.normalising import Normalise, Scale, scales
 from race.viewing.scores import Scored, Scores, reached
 
@@ -57,14 +57,15 @@ class Pair(NamedTuple):
     base: str
     difference: Estimate
     told_apart: bool | None
-    """None with a single seed of either."""
+    """None with too few seeds to tell."""
     seeds_needed: int | None
     """Of each, where they are not told apart; None: unknown, or more than a thousand."""
 
 
 class Overall(NamedTuple):
-    """A method over all common tasks, by normalised final scores."""
+    """A method over tasks that have the same methods, by normalised final scores."""
 
+    tasks: tuple[str, ...]
     method: str
     runs: int
     iqm: Estimate
@@ -77,6 +78,7 @@ class Against(NamedTuple):
     """A method and the base over the tasks that both were tried on."""
 
     method: str
+    """Or an algorithm, over one learner on some tasks and over another on others."""
     base: str
     improvement: Estimate
     tasks: tuple[str, ...]
@@ -91,12 +93,17 @@ class Comparison:
 
     team: str
     base: str | None
+    """`race.viewing.grouping.OF_EACH_TASK` where tasks have different ones."""
+    bases: dict[str, str]
+    """By task."""
     normalised: str
     """How, as a sentence."""
     tasks: tuple[str, ...]
     """All of them."""
     common: tuple[str, ...]
-    """Those over which methods are compared: tried with every method, and with a scale."""
+    """Those that were tried with every method, and have a scale."""
+    families: tuple[tuple[str, ...], ...]
+    """Those over which methods are compared: tried with the same methods, and with a scale."""
     on_tasks: list[OnTask]
     pairs: list[Pair]
     overall: list[Overall]
@@ -120,8 +127,8 @@ def compare(
     Args:
         scores: of all runs.
         team: whose tests they are; only said.
-        base: the method that others are measured against. None: the gradient learner that most
-            tasks were tried with; without one, the first method by name.
+        base: the method that others are measured against. None: on each task the gradient learner
+            that its methods are built on (`race.viewing.grouping.bases_of`).
         normalise: how scores of several tasks come to one scale (`race.viewing.normalising`).
         references: a file that says it instead.
         score: what `OnTask.time_to` is about. None: the base's mean final score on the task, or
@@ -130,68 +137,57 @@ def compare(
     Raises:
         RaceError: if the base is none of the methods, or the scale cannot be had.
     """
-    base = _base(scores, base)
-    scale, said, unscaled = scales(scores, normalise, base, references)
+    bases = bases_of(scores, base)
+    scale, said, unscaled = scales(scores, normalise, bases, references)
     methods = scores.methods()
-    common = tuple(
-        task for task in scores.tasks() if scores.methods(task) == methods and task in scale
-    )
+    families = families_of(scores, [task for task in scores.tasks() if task in scale])
     notes = [f"{task} has no normalised score: {why}." for task, why in unscaled.items()]
-    lacking = [task for task in scores.tasks() if scores.methods(task) != methods]
-    if lacking:
-        notes.append(
-            f"Not all methods were tried on {', '.join(lacking)}: left out of what is over tasks."
-        )
+    notes += _lacking(scores)
     on_tasks = [
-        _on_task(scores, task, method, _goal(scores, task, base, score))
+        _on_task(scores, task, method, _goal(scores, task, bases.get(task), score))
         for task in scores.tasks()
         for method in scores.methods(task)
     ]
     singles = [f"{row.method} on {row.task}" for row in on_tasks if len(row.seeds) == 1]
     if singles:
         notes.append(f"One seed has no interval: {', '.join(singles)}.")
-    others = [method for method in methods if method != base]
-    thresholds = _thresholds(scores, scale, common)
-    pairs = [
-        _pair(scores, task, method, base)
-        for task in scores.tasks()
-        for method in others
-        if base is not None and {method, base} <= set(scores.methods(task))
-    ]
-    against = [_against(scores, method, base) for method in others if base is not None]
+    thresholds = _thresholds(scores, scale, [task for family in families for task in family])
     return Comparison(
         team=team,
-        base=base,
+        base=name_of(bases.values()) if bases else None,
+        bases=bases,
         normalised=said,
         tasks=tuple(scores.tasks()),
-        common=common,
+        common=tuple(t for t in scores.tasks() if scores.methods(t) == methods and t in scale),
+        families=families,
         on_tasks=on_tasks,
-        pairs=pairs,
-        overall=[_overall(scores, m, scale, common, thresholds) for m in methods if common],
-        against=[row for row in against if row is not None],
+        pairs=[
+            _pair(scores, task, method, base)
+            for task, base in bases.items()
+            for method in scores.methods(task)
+            if method != base
+        ],
+        overall=[
+            _overall(scores, method, scale, family, thresholds)
+            for family in families
+            for method in scores.methods(family[0])
+        ],
+        against=_all_against(scores, bases),
         thresholds=thresholds,
         differences=scores.differences,
         notes=notes,
     )
 
 
-def _base(scores: Scores, asked: str | None) -> str | None:
-    methods = scores.methods()
-    if asked is not None:
-        if asked not in methods:
-            raise RaceError(
-                f"There is no method {asked!r} to be the base. There are: {'; '.join(methods)}."
-            )
-        return asked
-    if len(methods) < 2:
-        return None
-    plain = sorted({run.method for run in scores.runs if run.gradient_only})
-    by_tasks = sorted(plain, key=lambda name: (-len(_tasks_of(scores, name)), len(name)))
-    return (by_tasks or methods)[0]
-
-
-def _tasks_of(scores: Scores, method: str) -> list[str]:
-    return sorted({run.task for run in scores.runs if run.method == method})
+def _lacking(scores: Scores) -> list[str]:
+    """What to say where not all methods were tried on all tasks."""
+    alone = [task for task in scores.tasks() if len(scores.methods(task)) == 1]
+    if all(scores.methods(task) == scores.methods() for task in scores.tasks()):
+        return []
+    said = ["Not all methods were tried on all tasks: each is compared over tasks with the same."]
+    if alone:
+        said.append(f"One method alone was tried on {', '.join(alone)}: left out over tasks.")
+    return said
 
 
 def _finals(runs: list[Scored]) -> NDArray[np.float64]:
@@ -237,6 +233,8 @@ def _pair(scores: Scores, task: str, method: str, base: str) -> Pair:
     mine, its = _finals(scores.of(task, method)), _finals(scores.of(task, base))
     found = difference(mine, its)
     apart = None if math.isnan(found.low) else not found.low <= 0.0 <= found.high
+    if found.low == found.high != 0.0 and not surely_apart(len(mine), len(its)):
+        apart = None  # such as win rates that are all alike: Welch's test knows no spread
     return Pair(
         task, method, base, found, apart, seeds_needed(mine, its) if apart is False else None
     )
@@ -253,6 +251,7 @@ def _overall(
     shares = all(run.metric == "win_rate" for t in tasks for run in scores.of(t, method))
     bounds = (0.0, 1.0) if shares and set(map(scale.get, tasks)) == {Scale(0.0, 1.0)} else UNBOUNDED
     return Overall(
+        tasks,
         method,
         sum(map(len, strata)),
         bootstrap_interval(strata, interquartile_mean, bounds),
@@ -261,17 +260,28 @@ def _overall(
     )
 
 
-def _against(scores: Scores, method: str, base: str) -> Against | None:
-    tasks = [t for t in _tasks_of(scores, method) if t in _tasks_of(scores, base)]
-    if not tasks:
-        return None
-    mine = {task: _finals(scores.of(task, method)) for task in tasks}
-    its = {task: _finals(scores.of(task, base)) for task in tasks}
+def _all_against(scores: Scores, bases: dict[str, str]) -> list[Against]:
+    """Every method against the base, and algorithms whose methods share out the tasks."""
+    tried = {
+        method: [t for t, base in bases.items() if base != method and method in scores.methods(t)]
+        for method in scores.methods()
+    }
+    members = {method: dict.fromkeys(tasks, method) for method, tasks in tried.items() if tasks}
+    members |= pooled({method: tasks for method, tasks in tried.items() if tasks})
+    return [_against(scores, name, methods, bases) for name, methods in members.items()]
+
+
+def _against(scores: Scores, name: str, methods: dict[str, str], bases: dict[str, str]) -> Against:
+    """A row about the tasks of ``methods``, which says the method of each."""
+    tasks = tuple(sorted(methods))
+    mine = {task: _finals(scores.of(task, methods[task])) for task in tasks}
+    its = {task: _finals(scores.of(task, bases[task])) for task in tasks}
     improvement = probability_of_improvement(list(mine.values()), list(its.values()))
     positive = tuple(task for task in tasks if _clearly_positive(its[task]))
     strata = [finals[task] for finals in (mine, its) for task in positive]
     gain = bootstrap_interval(strata, relative_gain) if positive else None
-    return Against(method, base, improvement, tuple(tasks), gain, positive)
+    base = name_of(bases[task] for task in tasks)
+    return Against(name, base, improvement, tasks, gain, positive)
 
 
 def _clearly_positive(values: NDArray[np.float64]) -> bool:
@@ -279,9 +289,7 @@ def _clearly_positive(values: NDArray[np.float64]) -> bool:
     return bool(values.min() > 0)
 
 
-def _thresholds(
-    scores: Scores, scale: dict[str, Scale], tasks: tuple[str, ...]
-) -> NDArray[np.float64]:
+def _thresholds(scores: Scores, scale: dict[str, Scale], tasks: list[str]) -> NDArray[np.float64]:
     if not tasks:
         return np.zeros(0)
     ends = [scale[run.task](np.array([run.final])) for run in scores.runs if run.task in tasks]

@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from race.errors import RaceError
+from race.viewing.grouping import name_of
 from race.viewing.scores import Scores
 
 Normalise = Literal["range", "base", "none"]
@@ -26,7 +27,7 @@ class Scale(NamedTuple):
 
 
 def scales(
-    scores: Scores, how: Normalise, base: str | None, references: Path | None
+    scores: Scores, how: Normalise, bases: dict[str, str], references: Path | None
 ) -> tuple[dict[str, Scale], str, dict[str, str]]:
     """A scale for each task.
 
@@ -34,7 +35,7 @@ def scales(
         scores: of all runs.
         how: ``range``: from the worst to the best final score of any run on the task, shares such
             as win rates as they are; ``base``: from 0 to the base's mean; ``none``: as they are.
-        base: the method that ``base`` means.
+        bases: the method that ``base`` means on each task.
         references: a file that says low and high of each task, instead.
 
     Returns:
@@ -51,7 +52,7 @@ def scales(
         said = f"0 and 1 are the low and high scores of each task in {references.name}"
         return {task: given[task] for task in scores.tasks() if task in given}, said, missing
     found, without = {}, {}
-    if how == "base" and base is None:
+    if how == "base" and not bases:
         left_out = f" Mind: {scores.differences[0]}" if scores.differences else ""
         raise RaceError(
             f"There is one method alone with scores, {scores.methods()[0]}, so nothing to be a "
@@ -63,9 +64,12 @@ def scales(
         if how == "none" or (how == "range" and all(run.metric == "win_rate" for run in runs)):
             found[task] = Scale(0.0, 1.0)
         elif how == "base":
+            base = bases.get(task)
             mean = float(np.mean([run.final for run in runs if run.method == base] or [0.0]))
             if mean > 0:
                 found[task] = Scale(0.0, mean)
+            elif base is None:
+                without[task] = "its base was not tried on it"
             else:
                 without[task] = f"the mean of {base} is not above zero"
         elif finals.max() > finals.min():
@@ -75,7 +79,8 @@ def scales(
     said = {
         "range": "0 and 1 are the worst and the best final score of any run on the task, taken as "
         "exact (win rates as they are)",
-        "base": f"0 is a score of 0, 1 the mean final score of {base} on the task, taken as exact",
+        "base": f"0 is a score of 0, 1 the mean final score of {name_of(bases.values())} on the "
+        "task, taken as exact",
         "none": "scores are not normalised",
     }[how]
     return found, said, without

@@ -1,7 +1,9 @@
 """Figures of learning curves: runs of one method together, one panel per task."""
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +21,11 @@ from race.viewing import curves as chosen
 from race.viewing.curves import LABELS, Axis, Band, Curve, aggregate, ended_early
 
 FORMATS = (".png", ".svg", ".pdf")
+LONGEST_LINE = 64
+"""Characters of a line below a panel."""
+LINES_WITH_ROOM = 5
+"""Of a legend, in a panel of the usual height."""
+LINE_INCHES = 0.18
 
 # The paper's colours where it has any.
 _COLOURS = {
@@ -36,7 +43,10 @@ _DISCRETE_COLOURS = {
     **{"RACE(FACMAC)": "#d62728", "FACMAC": "#222222"},
     **{"MERL(FACMAC)": "#1f77b4", "EA": "#2ca02c"},
 }
-_OTHER_COLOURS = ("#ff7f0e", "#9467bd", "#2ca02c", "#17becf", "#bcbd22")
+_OTHER_COLOURS = (
+    *("#ff7f0e", "#9467bd", "#17becf", "#bcbd22", "#7f7f7f", "#e6ab02", "#1b4f9c", "#a6d96a"),
+    *("#c51b7d", "#66c2a5", "#b15928", "#fb9a99"),
+)
 _AXES = {"return_mean": "test return", "win_rate": "test win rate"}
 _LINES = {"selected": "-", "marl": "--", "champion": ":", "best": "-."}
 
@@ -101,6 +111,7 @@ def plot(
     for index, (task, methods) in enumerate(sorted(panels.items())):
         axes = figure.add_subplot(rows, columns, index + 1)
         found += _panel(axes, task, methods, metric, axis, with_seeds=team != "all")
+    make_room(figure, rows, 4.8)
     with written_aside(out) as temporary:
         figure.savefig(temporary, dpi=150)
     return Drawn(found, without)
@@ -156,14 +167,13 @@ def draw(
 ) -> None:
     """A mean with what surrounds it; fainter where some of its runs have already ended."""
     seeds = f"{len(runs)} seed{'s' if len(runs) > 1 else ''}"
+    label = wrapped(f"{name} ({seeds})")
     style: dict[str, Any] = {"color": colour, "linestyle": line, "linewidth": 1.8}
     marker = "o" if band.x.size == 1 else None
     whole = np.flatnonzero(band.seeds == band.seeds.max())
     first, last = int(whole[0]), int(whole[-1]) + 1
     axes.plot(band.x, band.mean, alpha=0.4, **style)
-    axes.plot(
-        band.x[first:last], band.mean[first:last], marker=marker, label=f"{name} ({seeds})", **style
-    )
+    axes.plot(band.x[first:last], band.mean[first:last], marker=marker, label=label, **style)
     if with_seeds and len(runs) >= LEAST_SEEDS_OF_A_BAND:
         limits = axes.dataLim.frozen()
         axes.fill_between(band.x, band.low, band.high, color=colour, alpha=0.18, linewidth=0)
@@ -186,16 +196,34 @@ def colours_of(names: Sequence[str]) -> dict[str, str]:
 def _colours(methods: Methods) -> dict[tuple[str, str], str]:
     """A colour for each method, and for each of several experiments with one method."""
     known = _DISCRETE_COLOURS if set(_DISCRETE_COLOURS) >= {m for m, _ in methods} else _COLOURS
-    spare: Iterator[str] = iter(_OTHER_COLOURS * 20)
-    taken: dict[tuple[str, str], str] = {}
-    for method, name in sorted(methods, reverse=True):
-        experiment = name.rsplit(", ", 1)[0] if name.endswith(tuple(LABELS.values())) else name
-        if (method, experiment) not in taken:
-            own = known.get(method)
-            free = own is not None and own not in taken.values()
-            taken[method, experiment] = str(own) if free else next(spare)
-        taken[method, name] = taken[method, experiment]
-    return taken
+    all_of = dict.fromkeys((m, _experiment(name)) for m, name in sorted(methods, reverse=True))
+    own: dict[str, tuple[str, str]] = {}  # whose colour it is
+    for method, experiment in all_of:
+        if method in known:
+            own.setdefault(known[method], (method, experiment))
+    colours = {of: colour for colour, of in own.items()}
+    spare = itertools.cycle([colour for colour in _OTHER_COLOURS if colour not in own])
+    colours |= {of: next(spare) for of in all_of if of not in colours}
+    return {(method, name): colours[method, _experiment(name)] for method, name in methods}
+
+
+def _experiment(name: str) -> str:
+    """A curve's name without whose tests it shows."""
+    return name.rsplit(", ", 1)[0] if name.endswith(tuple(LABELS.values())) else name
+
+
+def wrapped(name: str) -> str:
+    """A name that fits below a panel: those of runs with many settings are long."""
+    return "\n".join(textwrap.wrap(name, LONGEST_LINE, break_on_hyphens=False))
+
+
+def make_room(figure: Figure, rows: int, height: float) -> None:
+    """Gives each row of panels its height in inches, and more where a legend has many lines."""
+    legends = [legend for axes in figure.axes if (legend := axes.get_legend()) is not None]
+    lines = max(
+        sum(1 + text.get_text().count("\n") for text in legend.get_texts()) for legend in legends
+    )
+    figure.set_figheight(rows * (height + LINE_INCHES * max(lines - LINES_WITH_ROOM, 0)))
 
 
 def frame(axes: Axes, task: str, metric: str, axis: Axis) -> None:

@@ -33,6 +33,8 @@ class Scored(NamedTuple):
     """The same tests over wall seconds."""
     gradient_only: bool
     """Whether the method has no population: a base."""
+    learner: str | None
+    """The gradient learner that it is or is built on; None if it has none."""
 
 
 class Scores(NamedTuple):
@@ -104,6 +106,7 @@ def scores_of(runs: Sequence[Recorded], metric: str = "auto", team: str = "selec
                         *(task, name, run.config.seed, run.name, wanted, final),
                         *(_mean_until(curve, horizon), curve, seconds),
                         not run.config.has_population,
+                        run.config.base if run.config.has_marl else None,
                     )
                 )
     return Scores(scored, horizons, differences)

@@ -5,14 +5,14 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from race.statistics.intervals import Estimate
 from race.statistics.separation import MOST_SEEDS
-from race.viewing.comparison import Comparison, OnTask, Pair
+from race.viewing.comparison import Against, Comparison, OnTask, Pair
 
 Format = Literal["text", "markdown", "latex", "csv", "json"]
 SUFFIXES: dict[str, Format] = {
@@ -37,7 +37,12 @@ class Table(NamedTuple):
 def tables_of(found: Comparison) -> list[Table]:
     """What people read: a table for each task, and one over tasks."""
     said = [_of_task(found, task) for task in found.tasks]
-    return [*said, _over_tasks(found)] if found.overall or found.against else said
+    if len(found.families) > 1:
+        said += [_over_tasks(found, family, with_base=False) for family in found.families]
+        return [*said, _against(found)] if found.against else said
+    if not found.overall and not found.against:
+        return said
+    return [*said, _over_tasks(found, *found.families, with_base=True)]
 
 
 def remarks(found: Comparison) -> list[str]:
@@ -93,7 +98,7 @@ def seconds(value: float) -> str:
 def _of_task(found: Comparison, task: str) -> Table:
     rows = [row for row in found.on_tasks if row.task == task]
     pairs = {pair.method: pair for pair in found.pairs if pair.task == task}
-    based = f"minus {found.base}" if pairs else ""
+    based = f"minus {found.bases[task]}" if pairs else ""
     columns = ["method", "seeds", "final", "area", f"time to {number(rows[0].time_to.score)}"]
     lines = []
     for row in sorted(rows, key=lambda row: -row.final.value):
@@ -120,16 +125,17 @@ def _time(row: OnTask) -> str:
 def _pair(pair: Pair | None) -> list[str]:
     if pair is None:
         return [MISSING, MISSING]
-    told = {True: "yes", None: "one seed cannot tell"}.get(pair.told_apart)
+    told = {True: "yes", None: "too few seeds to tell"}.get(pair.told_apart)
     if told is None:
         needed = pair.seeds_needed
         told = f"no: {needed} seeds each" if needed else f"no: over {MOST_SEEDS:,} seeds"
     return [estimate(pair.difference), told]
 
 
-def _over_tasks(found: Comparison) -> Table:
-    against = {row.method: row for row in found.against}
-    overall = {row.method: row for row in found.overall}
+def _over_tasks(found: Comparison, tasks: tuple[str, ...] = (), *, with_base: bool) -> Table:
+    """Methods over some tasks; with what tells them from the base, if that is all there is."""
+    against = {row.method: row for row in found.against if with_base}
+    overall = {row.method: row for row in found.overall if row.tasks == tasks}
     methods = sorted({*against, *overall})
     if overall:
         methods.sort(key=lambda name: -overall[name].iqm.value if name in overall else math.inf)
@@ -140,30 +146,45 @@ def _over_tasks(found: Comparison) -> Table:
         line += [MISSING] * 3 if whole is None else [str(whole.runs), estimate(whole.iqm)]
         line += [] if whole is None else [estimate(whole.gap)]
         if against:
-            gain = None if pair is None else pair.gain
-            line.append(MISSING if pair is None else estimate(pair.improvement))
-            line.append(MISSING if gain is None else estimate(gain, percent=True))
+            line += [MISSING] * 2 if pair is None else _beside(pair)
         lines.append(line)
     columns = ["method", "runs", "interquartile mean", "optimality gap"]
     if against:
         columns += [f"P(beats {found.base})", f"gain over {found.base}"]
-    tasks = f"{len(found.common)} task{'s' if len(found.common) != 1 else ''}"
+    note = f"Normalised: {found.normalised}. Tasks: {', '.join(tasks) or 'none'}."
+    if any(row.tasks != tasks for row in against.values()):
+        note += f" Against {found.base}, over all tasks that both were tried on."
     return Table(
-        f"Over {tasks if found.common else 'tasks'}, final scores", columns, lines, _scope(found)
+        f"Over {_count(tasks) if tasks else 'tasks'}, final scores",
+        *(columns, lines, note + _odd_gains(found if against else None)),
     )
 
 
-def _scope(found: Comparison) -> str:
-    said = [f"Normalised: {found.normalised}. Tasks: {', '.join(found.common) or 'none'}."]
-    if any(row.tasks != found.common for row in found.against):
-        said.append(f"Against {found.base}, over all tasks that both were tried on.")
-    odd = [row for row in found.against if row.gain_tasks != row.tasks]
-    if odd:
-        names = ", ".join(sorted({row.method for row in odd}))
-        said.append(
-            f"Gain over {found.base} of {names}: tasks where each of its runs is above zero alone."
-        )
-    return " ".join(said)
+def _against(found: Comparison) -> Table:
+    """Methods and their bases where there is no one set of tasks for all."""
+    rows = sorted(found.against, key=lambda row: -row.improvement.value)
+    base = found.base
+    lines = [[row.method, row.base, _count(row.tasks), *_beside(row)] for row in rows]
+    heads = ["method", "base", "over", f"P(beats {base})", f"gain over {base}"]
+    note = f"Over all tasks that both were tried on.{_odd_gains(found)}"
+    return Table(f"Against {base}, final scores", heads, lines, note)
+
+
+def _beside(row: Against) -> list[str]:
+    gain = MISSING if row.gain is None else estimate(row.gain, percent=True)
+    return [estimate(row.improvement), gain]
+
+
+def _count(tasks: Sequence[str]) -> str:
+    return f"{len(tasks)} task{'s' if len(tasks) != 1 else ''}"
+
+
+def _odd_gains(found: Comparison | None) -> str:
+    odd = [] if found is None else [r for r in found.against if r.gain_tasks != r.tasks]
+    if found is None or not odd:
+        return ""
+    names = ", ".join(sorted({row.method for row in odd}))
+    return f" Gain over {found.base} of {names}: tasks where each of its runs is above zero alone."
 
 
 LEGEND = (
@@ -254,7 +275,10 @@ def _csv(found: Comparison) -> str:
 
 
 def _flat(found: Comparison) -> Iterator[tuple[str, str, str, str, Estimate, int | str]]:
-    """One number a line: task (empty: over tasks), method, base, quantity, number, runs."""
+    """One number a line: task (empty: over tasks), method, base, quantity, number, runs.
+
+    Where methods were tried on different tasks, those that a number is over stand for its task.
+    """
     for row in found.on_tasks:
         runs = len(row.seeds)
         yield row.task, row.method, "", f"final_{row.metric}", row.final, runs
@@ -269,10 +293,11 @@ def _flat(found: Comparison) -> Iterator[tuple[str, str, str, str, Estimate, int
         number_needed = Estimate(needed, math.nan, math.nan)
         yield pair.task, pair.method, pair.base, "seeds_needed", number_needed, ""
     for whole in found.overall:
-        yield "", whole.method, "", "interquartile_mean", whole.iqm, whole.runs
-        yield "", whole.method, "", "optimality_gap", whole.gap, whole.runs
+        where = "; ".join(whole.tasks) if len(found.families) > 1 else ""
+        yield where, whole.method, "", "interquartile_mean", whole.iqm, whole.runs
+        yield where, whole.method, "", "optimality_gap", whole.gap, whole.runs
         for threshold, share in zip(found.thresholds, whole.profile, strict=True):
-            yield "", whole.method, "", f"share_above_{threshold:.4g}", share, whole.runs
+            yield where, whole.method, "", f"share_above_{threshold:.4g}", share, whole.runs
     for beside in found.against:
         yield "", beside.method, beside.base, "probability_of_improvement", beside.improvement, ""
         if beside.gain is not None:

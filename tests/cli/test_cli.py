@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import imageio_ffmpeg
 import pytest
 from commands import alone, fails, race
 from PIL import Image
+from whole_runs import rows
 
 from race.cli import COMMANDS, streams
 from race.config.settings import Config
@@ -514,3 +516,26 @@ def test_describe(capsys: pytest.CaptureFixture[str]) -> None:
     assert (told["n_agents"], told["other_agents"]) == (3, ["agent_0"])
     assert len(told["names"]["state"]) == told["state_size"] == 62
     assert "no task 'mamujoco/Hoper-3x1'" in fails("describe mamujoco/Hoper-3x1", capsys)
+
+
+def test_a_real_cluster_goes_on_with_a_run(run: Path) -> None:
+    """The smallest that a real Ray is asked to do; `test_cluster` says more, slowly."""
+    (run / "DONE").unlink()
+    before = rows(run)
+    words = [sys.executable, "-m", "race", "resume", str(run.parent), "--on", "ray"]
+    # A process of its own: Ray leaves threads and handlers of signals behind.
+    done = subprocess.run(words, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert "All 1 runs have finished" in done.stdout
+    assert (run / "DONE").exists()
+    assert "Finished after" in (run / "log.txt").read_text()  # said by the process that was sent
+    assert rows(run) == before
+    assert not list(run.parent.glob(".cluster-*"))
+
+
+def test_lost_metrics_are_not_taken_for_a_young_run(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run / "metrics.jsonl").unlink()
+    for command in ("compare", "plot"):
+        assert "rows are missing" in fails(f"{command} {run}", capsys)

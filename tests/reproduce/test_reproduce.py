@@ -8,6 +8,8 @@ import pytest
 from written_runs import written_run
 
 from race.cli import main
+from race.cli.planned import show_plan
+from race.config.cohort import CohortConfig
 from race.config.presets import TABLES
 from race.config.settings import Config
 from race.envs import make_task
@@ -183,9 +185,30 @@ def test_what_cannot_be(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
         (["fig2", "--draw-only", "--dir", str(tmp_path)], "There is no run of these figures"),
         (["fig2", "--scale", "-1"], "--scale is -1"),
         (["fig2", "--jobs", "0"], "--jobs"),
+        (["fig2", "--env-steps", "0", "--dry-run"], "--env-steps is 0"),
         (["fig2", "--seeds", "x"], "seeds"),
         (["fig2", "--tasks", "micro/nowhere", "--dry-run"], "nowhere"),
     ):
         with pytest.raises(SystemExit):
             main(["reproduce", *words])
         assert said in capsys.readouterr().err
+
+
+def test_runs_that_were_made_with_other_settings_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = "probe/target"
+    folder_of(tmp_path, planned("fig4", tasks=(task,)), "nothing")
+    words = ["--tasks", task, "--seeds", "1", "--dir", str(tmp_path), "--scale", "0.5"]
+    main(["reproduce", "fig4", *words, "--dry-run"])
+    assert "other settings" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        main(["reproduce", "fig4", *words])
+    told = " ".join(capsys.readouterr().err.split())
+    assert "holds a run with other settings (env_steps 1000000, asked: 500000)" in told
+    assert "another directory with --dir" in told
+
+
+def test_a_plan_of_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    show_plan(tmp_path, {}, CohortConfig())  # where --known has all runs
+    assert capsys.readouterr().out == "Nothing is left to run.\n"

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from race.statistics.intervals import mean_estimate
-from race.statistics.separation import difference, seeds_needed
+from race.statistics.separation import difference, seeds_needed, surely_apart
 from race.statistics.stratified import (
     bootstrap_interval,
     interquartile_mean,
@@ -166,3 +166,10 @@ def test_numbers_are_those_of_rliable() -> None:
     taus = np.linspace(-0.5, 1.5, 21)
     profile = [library.run_score_deviation(scores[0], tau) for tau in taus]
     np.testing.assert_allclose([p.value for p in share_above(X, taus)], profile)
+
+
+def test_four_seeds_of_each_can_tell_for_sure() -> None:
+    """By hand: 2 / 70 for four and four, 2 / 56 for five and three, 2 / 20 for three and three."""
+    assert [surely_apart(*n) for n in ((4, 4), (5, 3), (3, 3), (2, 2), (1, 9))] == [
+        *(True, True, False, False, False)
+    ]

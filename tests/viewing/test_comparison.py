@@ -18,11 +18,15 @@ from race.runs.results import load
 from race.statistics.intervals import mean_estimate
 from race.viewing.comparison import Comparison, compare
 from race.viewing.curves import aggregate
+from race.viewing.grouping import bases_of
+from race.viewing.normalising import scales
+from race.viewing.profiles import draw_profiles
 from race.viewing.scores import Scores, scores_of
 from race.viewing.tables import as_json, number, seconds, tables_of, written
 
 RACE, MATD3 = "RACE(MATD3)", "MATD3"
 HOPPER, ANT = "mamujoco/Hopper-3x1", "mamujoco/Ant-2x4"
+BATTLE = "micro/2s3z"
 FINALS = np.array([0.0, 40.0, 80.0, 120.0, 160.0])
 
 
@@ -147,7 +151,7 @@ def test_what_is_unlike_is_said(tmp_path: Path) -> None:
     assert [run.final for run in scores.runs] == [2.0, 2.0, 2.0]
     found = compare(scores)
     assert any("One seed has no interval: MATD3" in note for note in found.notes)
-    assert "one seed cannot tell" in written(found, "text")
+    assert "too few seeds to tell" in written(found, "text")
     with pytest.raises(SystemExit):
         main(["compare", str(tmp_path), "--strict"])
 
@@ -212,8 +216,103 @@ def test_the_command(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture
         ([], "Say which runs"),
         ([str(folder), "--out", "c.xlsx"], "must end with"),
         ([str(folder), "--profile", "c.txt"], "must end with"),
+        ([str(folder), "--score", "nan"], "--score is nan"),
         ([str(tmp_path / "nowhere")], "not a directory"),
     ):
         with pytest.raises(SystemExit):
             main(["compare", *words])
         assert said in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def two_kinds(tmp_path_factory: pytest.TempPathFactory) -> Scores:
+    """Robots and battles, as in the paper: RACE is over another learner on each."""
+    folder = tmp_path_factory.mktemp("two kinds")
+    levels = {"race": 1.2, "merl": 0.9, "matd3": 1.0, "facmac": 0.8, "ea": 0.5}
+    for task, most in ((HOPPER, 1000.0), (ANT, 2000.0), (BATTLE, 0.5)):
+        learners = ("facmac",) if most < 1 else ("matd3", "facmac")
+        for algo in ("race", "merl", "ea", *learners):
+            for seed in (1, 3):
+                level = most * levels[algo] * (1 + seed / 100)
+                level /= levels["facmac"] if most < 1 and algo == "facmac" else 1
+                told = {"task": task, "algo": algo, "seed": seed}
+                told |= {"base": "facmac"} if most < 1 and algo in ("race", "merl") else {}
+                quantity = "win_rate" if most < 1 else "return_mean"
+                written_run(folder / f"{task} {algo} {seed}", [(9, level)], None, quantity, **told)
+    return scores_of(load([folder]))
+
+
+@pytest.fixture(scope="module")
+def of_both(two_kinds: Scores) -> Comparison:
+    return compare(two_kinds)
+
+
+def test_each_task_has_the_base_that_its_methods_are_built_on(
+    two_kinds: Scores, of_both: Comparison
+) -> None:
+    # FACMAC was tried on more tasks, but RACE and MERL are over MATD3 on robots.
+    assert of_both.bases == {ANT: MATD3, HOPPER: MATD3, BATTLE: "FACMAC"}
+    assert {(pair.task, pair.method): pair.base for pair in of_both.pairs}[HOPPER, "FACMAC"] == (
+        MATD3
+    )
+    time_to = {(row.task, row.method): row.time_to.score for row in of_both.on_tasks}
+    assert time_to[HOPPER, RACE] == pytest.approx(1020)
+    assert set(bases_of(two_kinds, "FACMAC").values()) == {"FACMAC"}
+    found, _, _ = scales(two_kinds, "base", of_both.bases, None)
+    assert [found[task].high for task in (HOPPER, BATTLE)] == pytest.approx([1020, 0.51])
+
+
+def test_tasks_with_the_same_methods_are_taken_together(
+    of_both: Comparison, tmp_path: Path
+) -> None:
+    found = of_both
+    assert (found.common, found.families) == ((), ((ANT, HOPPER), (BATTLE,)))
+    runs = {(row.tasks, row.method): row.runs for row in found.overall}
+    assert runs[(ANT, HOPPER), RACE] == 4
+    assert runs[(BATTLE,), "RACE(FACMAC)"] == 2
+    assert len(runs) == 5 + 4
+    titles = [table.title for table in tables_of(found)]
+    ends = ["Over 2 tasks, final scores", "Over 1 task, final scores"]
+    assert titles[3:] == [*ends, "Against the base, final scores"]
+    assert "Not all methods were tried on all tasks" in written(found, "text")
+    draw_profiles(found, tmp_path / "profile.png")
+    picture = iio.imread(tmp_path / "profile.png")
+    assert picture.shape[1] > 1.5 * picture.shape[0]  # two panels side by side
+
+
+def test_the_gain_of_an_algorithm_is_over_the_base_of_each_task(of_both: Comparison) -> None:
+    """The paper's 34.4%: RACE over MATD3 on robots and over FACMAC on battles."""
+    found = of_both
+    rows = {row.method: row for row in found.against}
+    assert rows["RACE"].tasks == (ANT, HOPPER, BATTLE)
+    assert rows["RACE"].base == "the base"
+    assert rows["RACE"].gain is not None
+    assert rows["RACE"].gain.value == pytest.approx((0.2 + 0.2 + 0.2) / 3)
+    assert rows["MERL"].gain is not None
+    assert rows["MERL"].gain.value == pytest.approx(-0.1)
+    assert (rows["FACMAC"].base, rows["FACMAC"].tasks) == (MATD3, (ANT, HOPPER))
+    assert rows["EA"].tasks == (ANT, HOPPER, BATTLE)  # one method on all of them
+    assert MATD3 not in rows
+    (line,) = (line for line in tables_of(found)[-1].rows if line[0] == "RACE")
+    assert line[1:3] == ["the base", "3 tasks"]
+    assert line[-1].startswith("20.0%")
+    flat = list(csv.DictReader(io.StringIO(written(found, "csv"))))
+    assert {r["task"] for r in flat if r["quantity"] == "optimality_gap"} == {
+        f"{ANT}; {HOPPER}",
+        BATTLE,
+    }
+
+
+@pytest.mark.parametrize(("seeds", "apart"), [(2, None), (4, True)])
+def test_seeds_that_are_all_alike_prove_something_only_if_they_are_many(
+    tmp_path: Path, seeds: int, apart: bool | None
+) -> None:
+    """Win rates of 1 and 0.97 have no spread, so that Welch's interval has no width."""
+    for algo, rate in (("race", 1.0), ("facmac", 0.97)):
+        for seed in range(seeds):
+            told = {"task": BATTLE, "algo": algo, "seed": seed}
+            written_run(tmp_path / f"{algo} {seed}", [(9, rate)], None, "win_rate", None, **told)
+    found = compare(scores_of(load([tmp_path])))
+    (pair,) = found.pairs
+    assert (pair.difference.value, pair.told_apart) == (pytest.approx(0.03), apart)
+    assert ("too few seeds to tell" if apart is None else "yes") in written(found, "text")

@@ -7,10 +7,11 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from race.config import saved as configs
 from race.config.presets import resolve
-from race.config.settings import Config, LearnerConfig
+from race.config.settings import Config, LearnerConfig, RaceConfig
 from race.errors import RaceError, RunDirectoryError
 from race.statistics.intervals import mean_interval
 from race.viewing import plotting
@@ -250,3 +251,34 @@ def test_wall_time_on_the_axis(tmp_path: Path) -> None:
     )
     (summary,) = plot([run], tmp_path / "a.png", axis="wall_time").summaries
     assert summary.x == 1.5
+
+
+def test_long_names_stay_on_the_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for seed in range(8):
+        race = RaceConfig(
+            mutation_fraction=0.1 + seed / 10, vmm_weight=1e-3 * 2**seed, population_size=5 + seed
+        )
+        make_run(tmp_path / f"{seed}", [(100, 1.0), (200, 2.0)], seed=seed, race=race)
+    drawn: list[Figure] = []
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, file, **_: (drawn.append(figure), file.touch())
+    )
+    plot([tmp_path], tmp_path / "names.png")
+    (figure,) = drawn
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert "race.vmm_weight=" in legend.get_texts()[0].get_text()
+    box, whole = legend.get_window_extent(), figure.bbox
+    assert whole.x0 <= box.x0 < box.x1 <= whole.x1
+    assert whole.y0 - 4 <= box.y0  # nothing but the margin below the last line
+    assert axes.get_window_extent().height > 2.5 * figure.dpi  # inches
+
+
+def test_a_dozen_curves_have_colours_of_their_own() -> None:
+    names = [f"RACE(MATD3) race.mutation_fraction={k / 10}" for k in range(8)]
+    found = plotting.colours_of(["EA", "MATD3", "MERL(MATD3)", "FACMAC", *names])
+    assert len(set(found.values())) == 12
+    assert (found["EA"], found["MATD3"]) == ("#2ca02c", "#222222")  # the paper's
+    assert "#d62728" in {found[name] for name in names}

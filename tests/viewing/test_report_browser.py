@@ -13,6 +13,7 @@ from test_report import generations
 from written_runs import experiment, written_run
 
 from race.cli import main
+from race.config.settings import RaceConfig
 from race.runs.results import load
 from race.viewing.report.content import content_of
 from race.viewing.report.page import page_of
@@ -253,11 +254,48 @@ def test_a_watched_page_loads_itself_again(browser: Any, tmp_path: Path) -> None
         thread = threading.Thread(target=serving.serve_forever, daemon=True)
         thread.start()
         window = Window(browser, f"http://127.0.0.1:{serving.server_port}/")
-        with (runs / "metrics.jsonl").open("a") as file:
-            row = {"kind": "evaluation", "env_steps": 200, "eval/selected/return_mean": 2.0}
-            file.write(json.dumps(row | {"wall_seconds": 20.0}) + "\n")
-        window.wait("document.querySelector('#curves .chart')?.data?.some(t => t.x.length === 2)")
+        points = "document.querySelector('#curves .chart')?.data?.[0].x.length"
+
+        def write(steps: int) -> None:
+            with (runs / "metrics.jsonl").open("a") as file:
+                row = {"kind": "evaluation", "env_steps": steps, "eval/selected/return_mean": 2.0}
+                file.write(json.dumps(row | {"wall_seconds": 20.0}) + "\n")
+
+        write(200)
+        window.wait(f"{points} === 2")
+        # Not under the hands of somebody.
+        window.page.keyboard.press("Tab")
+        write(300)
+        for _ in range(8):
+            time.sleep(0.5)
+            assert window.page.evaluate(f"{points} === 2")
+            window.page.keyboard.press("Tab")
+        window.wait(f"{points} === 3")
         assert window.said == []
         assert {url.rpartition("/")[2] for url in window.asked} <= {"", "fingerprint"}
         serving.shutdown()
         thread.join()
+
+
+def test_long_names_leave_room_for_curves(browser: Any, tmp_path: Path) -> None:
+    for seed in range(8):
+        race = RaceConfig(
+            mutation_fraction=0.1 + seed / 10, vmm_weight=1e-3 * 2**seed, population_size=5 + seed
+        )
+        written_run(tmp_path / f"{seed}", [(100, 1.0), (200, 2.0)], seed=seed, race=race)
+    main(["report", str(tmp_path), "--out", str(tmp_path / "page.html")])
+    window = Window(browser, (tmp_path / "page.html").as_uri(), width=390)
+    plot = window.page.locator("#curves .chart .nsewdrag").bounding_box()
+    assert plot["height"] > 150
+    keys = window.page.locator("#curves .keys button")
+    assert keys.count() == 8
+    assert all(keys.nth(k).bounding_box()["x"] + 20 < 390 for k in range(8))
+    shown = "document.querySelector('#curves .chart').data.filter(t => t.visible !== false).length"
+    before = window.page.evaluate(shown)
+    keys.first.click()
+    assert window.page.evaluate(shown) < before
+    keys.first.click()
+    assert window.page.evaluate(shown) == before
+    # Words before a choice are whole.
+    assert window.page.locator("label", has_text="run").first.bounding_box()["height"] < 50
+    assert window.said == []

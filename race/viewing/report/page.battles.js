@@ -111,7 +111,7 @@ window.battlePlayer = (() => {
     bar.append(play, slider, speed);
     box.replaceChildren(canvas, bar, words);
     paint();
-    return { paint, stop };
+    return { paint, stop, playing: () => before !== null };
   }
   return { show };
 })();

@@ -58,7 +58,7 @@
     const head = grid.createTHead().insertRow();
     for (const name of columns) head.append(Object.assign(document.createElement("th"), { textContent: name }));
     const body = grid.createTBody();
-    for (const row of rows) { const line = body.insertRow(); for (const cell of row) line.insertCell().textContent = cell; }
+    for (const row of rows) { const line = body.insertRow(); for (const cell of row) Object.assign(line.insertCell(), { textContent: cell, className: String(cell).length > 32 ? "long" : "" }); }
     box.append(grid); place.append(box);
     if (note) place.append(Object.assign(document.createElement("p"), { className: "note", textContent: note }));
   }
@@ -68,16 +68,33 @@
     const axis = { gridcolor: value("--line"), zerolinecolor: value("--line"), automargin: true };
     return {
       title: { text: `${title}<br><sub>${[y, x].filter(Boolean).join(", by ")}</sub>`, font: { size: 14 }, x: 0.02, xanchor: "left" }, font: { color: value("--text"), size: 12 },
-      paper_bgcolor: value("--back"), plot_bgcolor: value("--back"), margin: { l: 40, r: 12, t: 64, b: 30 },
-      xaxis: { ...axis }, yaxis: { ...axis }, legend: { orientation: "h", y: -0.14, yanchor: "top", font: { size: 11 } }, hovermode: "closest", ...more,
+      paper_bgcolor: value("--back"), plot_bgcolor: value("--back"), margin: { l: 40, r: 12, t: 64, b: 36 },
+      xaxis: { ...axis }, yaxis: { ...axis }, showlegend: false, hovermode: "closest", ...more,
     };
   }
   const OPTIONS = { responsive: true, displaylogo: false, modeBarButtonsToRemove: ["lasso2d", "select2d"] };
   // Drawn once all boxes of a section are there: only then is it known how wide each is.
   const waiting = [];
   function chart(place, traces, form) {
-    const box = document.createElement("div");
-    box.className = "chart"; place.append(box); waiting.push([box, traces, form]);
+    const card = document.createElement("div"), box = document.createElement("div");
+    card.className = "card"; box.className = "chart"; card.append(box, keys(box, traces)); place.append(card); waiting.push([box, traces, form]);
+  }
+  // What the colours are, below the chart: long names would leave a legend inside of it no room for curves.
+  function keys(box, traces) {
+    const list = document.createElement("div");
+    list.className = "keys";
+    const group = (trace) => trace.legendgroup || trace.name;
+    for (const trace of traces.filter((t) => t.name && t.showlegend !== false)) {
+      const key = document.createElement("button"), swatch = document.createElement("span");
+      Object.assign(key, { type: "button", title: "show or hide" }); key.setAttribute("aria-pressed", "true");
+      swatch.className = "swatch"; swatch.style.background = (trace.line || trace.marker).color;
+      key.append(swatch, trace.name); list.append(key);
+      key.addEventListener("click", () => {
+        const on = key.getAttribute("aria-pressed") !== "true", mine = traces.flatMap((t, i) => (group(t) === group(trace) ? [i] : []));
+        key.setAttribute("aria-pressed", String(on)); Plotly.restyle(box, { visible: on }, mine);
+      });
+    }
+    return list;
   }
   function draw() { for (const [box, traces, form] of waiting.splice(0)) Plotly.newPlot(box, traces, form, OPTIONS); }
   function clear(place) {
@@ -99,10 +116,13 @@
           traces.push({ ...group, x: band.x, y: band.low, mode: "lines", line: { width: 0 }, hoverinfo: "skip", showlegend: false });
           traces.push({ ...group, x: band.x, y: band.high, mode: "lines", line: { width: 0 }, fill: "tonexty", fillcolor: faint(hue, 0.16), hoverinfo: "skip", showlegend: false });
         }
-        some.forEach((run, place) => {
+        let told = whole;
+        for (const run of some) {
           const y = run.tests[run.keys[`${team}/${metric}`]];
-          if (y) traces.push({ ...group, x: run.tests[axis], y, mode: "lines", line: { width: whole ? 0.8 : 1.4, color: faint(hue, whole ? 0.5 : 0.9) }, name: whole ? `seed ${run.seed}` : `${method} (seeds alone)`, showlegend: !whole && place === 0, hovertemplate: `seed ${run.seed}: %{y}<extra>${method}</extra>` });
-        });
+          if (!y) continue;
+          traces.push({ ...group, x: run.tests[axis], y, mode: "lines", line: { width: whole ? 0.8 : 1.4, color: faint(hue, whole ? 0.5 : 0.9) }, name: whole ? `seed ${run.seed}` : `${method} (seeds alone)`, showlegend: !told, hovertemplate: `seed ${run.seed}: %{y}<extra>${method}</extra>` });
+          told = true;
+        }
         if (whole) traces.push({ ...group, x: band.x, y: band.mean, mode: band.x.length > 1 ? "lines" : "markers", line: { width: 2.6, color: hue }, marker: { color: hue }, name: `${method} (${band.seeds})` });
       }
       if (traces.length) chart($("curves"), traces, layout(task, xName(), METRICS[metric]));
@@ -158,7 +178,7 @@
       });
       chart(place, tree, layout(`Where the last teams come from${a.cut[0] ? " (the newest part)" : ""}`, "generation of birth", "fitness when first measured"));
       const won = data.kinds.map((name, k) => [name, run.winners[k], KIND_COLOURS[k]]).filter((w) => w[1]);
-      chart(place, [{ type: "bar", x: won.map((w) => w[0].replace(" and ", "<br>and ")), y: won.map((w) => w[1]), marker: { color: won.map((w) => w[2]) } }], layout("Teams that were the fittest of a generation", "", "teams", { showlegend: false }));
+      chart(place, [{ type: "bar", x: won.map((w) => w[0].replace(" and ", "<br>and ")), y: won.map((w) => w[1]), marker: { color: won.map((w) => w[2]) } }], layout("Teams that were the fittest of a generation", "", "teams"));
     }
     distances(run.distances, place);
     const lines = (title, keys) => {
@@ -215,7 +235,7 @@
   function videos() { $("videos").replaceChildren(...data.runs.filter((run) => run.video && shown(run)).map(film)); }
 
   function drawAll() {
-    document.querySelectorAll(".swatch").forEach((s) => { s.style.background = colour(s.dataset.method); });
+    document.querySelectorAll("#methods .swatch").forEach((s) => { s.style.background = colour(s.dataset.method); });
     curves(); losses(); runList(); evolution(); battleList(); battle(); videos();
     document.body.dataset.drawn = String(Number(document.body.dataset.drawn || 0) + 1);
   }
@@ -233,7 +253,12 @@
   }
   function watch() {
     const known = document.body.dataset.watched;
-    if (known) setInterval(async () => {
+    if (!known) return;
+    let touched = 0; // when somebody last did something: what is being looked at is not taken away
+    for (const kind of ["pointerdown", "keydown", "wheel"]) addEventListener(kind, () => { touched = Date.now(); }, { passive: true });
+    const busy = () => Date.now() - touched < 8000 || (fought && fought.player && fought.player.playing()) || [...document.querySelectorAll("video")].some((v) => !v.paused);
+    setInterval(async () => {
+      if (busy()) return;
       try { const now = await (await fetch("fingerprint")).text(); if (now !== known) location.reload(); } catch { /* the server has gone */ }
     }, 3000);
   }
