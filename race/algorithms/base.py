@@ -70,8 +70,8 @@ class Algorithm(NamedTuple):
     are both."""
     population: Callable[[Any], Population | None]
     """state -> the population, if there is one."""
-    expected: Callable[..., Float[Array, "T"]] | None
-    """(state, states [T S], spec, shape) -> what each of the teams that act is worth where it is,
+    expected: Callable[..., Float[Array, "P"]] | None
+    """(state, states [P S], spec, shape) -> what each team of the population is worth where it is,
     by the PeVFA; None without one. For tasks with continuous actions."""
     critic_losses: tuple[str, ...]
     policy_losses: tuple[str, ...]

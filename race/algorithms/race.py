@@ -147,21 +147,21 @@ def update(
 
 
 def expected(
-    state: RaceState, states: Float[Array, "T S"], spec: Spec, shape: Shape
-) -> Float[Array, "T"]:
-    """``Q_theta(s, pi_j(s), W_j)`` of all teams, the MARL team among them."""
+    state: RaceState, states: Float[Array, "P S"], spec: Spec, shape: Shape
+) -> Float[Array, "P"]:
+    """``Q_theta(s, pi_j(s), W_j)`` of the population, each team in a state of its own."""
     learner = learner_of(shape)
-    acting, pevfa = teams(state, spec, shape), state.critics.pevfa.params
+    encoder, pevfa = state.policies.encoder.params, state.critics.pevfa.params
     unused = jax.random.key(0)  # policies of continuous actions are deterministic
 
     def of_one(head: Float[Array, "N H1 A"], at: Float[Array, "S"]) -> Float[Array, ""]:
         moments = at[None]
-        z = learner.encode(acting.encoder, moments, spec)
+        z = learner.encode(encoder, moments, spec)
         action = learner.act(z, head, moments, unused, spec)
         values = learner.q_team(pevfa, moments, action, head, spec)
         return learner.pessimistic(values)[0]
 
-    return jax.vmap(of_one)(acting.heads, states)
+    return jax.vmap(of_one)(state.heads, states)
 
 
 def entrant(state: RaceState, shape: Shape) -> Team:

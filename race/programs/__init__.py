@@ -208,14 +208,14 @@ def start(
 @partial(jax.jit, static_argnames=("algorithm", "spec", "shape"))
 def expected(
     state: Any,
-    states: Float[Array, "T S"] | Float[np.ndarray, "T S"],
+    states: Float[Array, "P S"] | Float[np.ndarray, "P S"],
     *,
     algorithm: Algorithm,
     spec: Spec,
     shape: Shape,
     scaling: Scaling | None = None,
-) -> Float[Array, "T"]:
-    """What each of the teams that act is worth where it is, by the PeVFA."""
+) -> Float[Array, "P"]:
+    """What each team of the population is worth where it is, by the PeVFA."""
     TRACES["expected"] += 1
     assert algorithm.expected is not None
     shown = jnp.asarray(states)

@@ -88,7 +88,7 @@ class Generation(NamedTuple):
     observed: Observed | None = None
     """What all teams saw, where observations are normalised."""
     beginnings: Beginnings | None = None
-    """Of all teams, where the population played no more; their returns are of what was played."""
+    """Of the population, where it played no more; its returns are of what was played."""
 
 
 class WarmUp(NamedTuple):

@@ -19,17 +19,18 @@ class Beginnings(NamedTuple):
     """Where they were."""
 
 
-def beginnings(rollout: Rollout, steps: int, discount: float) -> Beginnings:
-    """The beginnings of all teams' episodes, which may go on.
+def beginnings(rollout: Rollout, teams: int, steps: int, discount: float) -> Beginnings:
+    """The beginnings of teams' episodes, which may go on.
 
     Args:
-        rollout: at least a step of each team.
+        rollout: at least a step of each of the teams.
+        teams: how many; the first ones.
         steps: of a beginning.
         discount: gamma.
     """
     found: list[tuple[float, float, np.ndarray]] = []
     transitions = rollout.transitions
-    for team in range(len(rollout.episode_return)):
+    for team in range(teams):
         rows = np.flatnonzero(rollout.team == team)[:steps]
         factors = discount ** np.arange(len(rows) + 1, dtype=np.float64)
         ended = transitions.terminated[rows[-1]] > 0

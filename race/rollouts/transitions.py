@@ -135,8 +135,9 @@ class TransitionRollouts(Closing):
             observed = seen_by(played, play.config)
             begun = None
             if play.beginnings is not None:
+                population = play.teams.count - play.n_marl
                 discount = play.config.learner.discount
-                begun = beginnings(played, play.beginnings, discount)
+                begun = beginnings(played, population, play.beginnings, discount)
             made = Generation(played.episode_return, steps, repeated, observed, begun)
             results.append((replay, made))
         return results
@@ -174,22 +175,8 @@ class TransitionRollouts(Closing):
                 actions[exploring] += scale * noise.standard_normal(shape, np.float32)
             return actions
 
-        longest = [
-            np.full(play.teams.count, spec.episode_limit)
-            if play.beginnings is None
-            else np.where(
-                np.arange(play.teams.count) < play.teams.count - play.n_marl,
-                play.beginnings,
-                spec.episode_limit,
-            )
-            for play in plays
-        ]
-        rollout = collect(
-            self._pool,
-            choose,
-            np.concatenate([part[:-1] for part in seeds]),
-            np.concatenate(longest),
-        )
+        longest = np.concatenate([_longest(play, spec.episode_limit) for play in plays])
+        rollout = collect(self._pool, choose, np.concatenate([p[:-1] for p in seeds]), longest)
         return [rollout.of(teams) for teams in acting.parts]
 
     def test(self, trials: Sequence[Trial]) -> list[dict[str, Score]]:
@@ -253,6 +240,14 @@ class _Acting:
             for teams, part in zip(self._runs, self.parts, strict=True)
         ]
         return np.concatenate(each)
+
+
+def _longest(play: Play, limit: int) -> NDArray[np.int64]:
+    """Of each team, how many steps it plays at most."""
+    steps = np.full(play.teams.count, limit)
+    if play.beginnings is not None:
+        steps[: play.teams.count - play.n_marl] = play.beginnings
+    return steps
 
 
 def _joined(parts: list[Score]) -> Score:

@@ -60,7 +60,8 @@ def to_play(run: Run, state: RunState) -> Play:
     if n_marl:
         teams = teams.last_again(n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
-    steps = config.race.surrogate_steps if _surrogate_due(config, progress) else None
+    judged_early = teams.count > n_marl and _surrogate_due(config, progress)
+    steps = config.race.surrogate_steps if judged_early else None
     return Play(config, teams, n_marl, progress.generation, progress.env_steps, state.replay, steps)
 
 
@@ -77,9 +78,9 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     """The state with the results of the episodes; the generation's gradient steps are next."""
     progress, returns = state.progress, played.episode_return.tolist()
     n_teams = len(returns) - n_marl
-    fitness, of_marl, marl_fitness = returns[:n_teams], returns[n_teams:], None
-    if played.beginnings is not None and n_teams:
-        *fitness, marl_fitness = _judged(run, state, played.beginnings)
+    fitness, of_marl = returns[:n_teams], returns[n_teams:]
+    if played.beginnings is not None:
+        fitness = _judged(run, state, played.beginnings)
     progress = progress.but(
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
@@ -88,7 +89,7 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
         generation=progress.generation + 1,
         fitness=tuple(fitness),
         marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
-        marl_fitness=marl_fitness,
+        estimated=played.beginnings is not None,
         learning=True,
         repeated=progress.repeated + played.repeated,
     )
@@ -96,17 +97,13 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
 
 
 def _judged(run: Run, state: RunState, begun: Beginnings) -> list[float]:
-    """Discounted returns of all teams, of which the PeVFA guesses what lies behind a beginning.
+    """Discounted returns of the population; the PeVFA guesses what lies behind a beginning.
 
-    In the task's own units, whatever rewards are multiplied by for learning. Of several episodes of
-    the MARL team, the first counts.
+    In the task's own units, whatever rewards are multiplied by for learning.
     """
-    one_each = slice(run.config.race.population_size + 1)
-    values = programs.expected(
-        state.algorithm, begun.state[one_each], **run.statics, scaling=state.scaling
-    )
+    values = programs.expected(state.algorithm, begun.state, **run.statics, scaling=state.scaling)
     ahead = np.asarray(values, np.float64) / run.config.env.reward_scale
-    judged: list[float] = (begun.rewards[one_each] + begun.weight[one_each] * ahead).tolist()
+    judged: list[float] = (begun.rewards + begun.weight * ahead).tolist()
     return judged
 
 

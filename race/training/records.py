@@ -30,7 +30,7 @@ def generation_row(
         row["marl/return"] = progress.marl_return
     if progress.fitness:
         if config.race.surrogate_probability:
-            row["population/surrogate"] = progress.marl_fitness is not None
+            row["population/surrogate"] = progress.estimated
         row["population/fitness_max"] = max(progress.fitness)
         row["population/fitness_mean"] = sum(progress.fitness) / len(progress.fitness)
         row["population/fitness_min"] = min(progress.fitness)

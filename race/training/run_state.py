@@ -43,9 +43,8 @@ class Progress:
     marl_return: float | None = 0.0
     """Training return of the MARL team in the newest generation, the mean of its episodes; None
     where there is no such team."""
-    marl_fitness: float | None = None
-    """What the MARL team would be judged by, where the population is judged by no whole episodes;
-    None where its return is what compares."""
+    estimated: bool = False
+    """Whether the population of the newest generation was judged by beginnings of episodes."""
     evaluated_at: int = 0
     """``env_steps`` of the newest evaluation."""
     wall_seconds: float = 0.0
@@ -61,11 +60,15 @@ class Progress:
 
     @property
     def selected(self) -> str:
-        """Of the MARL team and the champion, the one with the better training return."""
+        """Of the MARL team and the champion, the one with the better training return.
+
+        A champion of which no whole episode is known is not selected.
+        """
         if self.marl_return is None:
             return "champion"
-        rival = self.marl_return if self.marl_fitness is None else self.marl_fitness
-        return "champion" if self.fitness and max(self.fitness) > rival else "marl"
+        if self.estimated or not self.fitness:
+            return "marl"
+        return "champion" if max(self.fitness) > self.marl_return else "marl"
 
     @property
     def times(self) -> dict[str, float]:

@@ -250,7 +250,7 @@ def progress_of(saved: Checkpoint) -> Progress:
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
     # Runs of before they were there lack the last two.
-    if not isinstance(values, dict) or set(values) | {"repeated", "marl_fitness"} != names:
+    if not isinstance(values, dict) or set(values) | {"repeated", "estimated"} != names:
         raise CheckpointError(
             f"The checkpoint {saved.path} was not written by this version of race: its record of "
             "the run's progress differs. Use the version named in metadata.json."

@@ -204,17 +204,17 @@ def test_one_policy_embedding_for_both_critics(
 def test_what_teams_are_worth_where_they_are(
     tiny_spec: EnvSpec, tiny_config: Callable[..., Config]
 ) -> None:
-    """The smaller of the PeVFA's two values of each team, the MARL team the last."""
+    """The smaller of the PeVFA's two values of each team of the population."""
     config = tiny_config("race", "matd3")
     fresh, shape = start(config, tiny_spec)
     state = separate(fresh)
-    size = config.race.population_size + 1
+    size = config.race.population_size
     states = np.random.default_rng(0).normal(size=(size, tiny_spec.state_size))
     found = jax.jit(lambda at: race.expected(state, at, tiny_spec, shape))(
         jnp.asarray(states, jnp.float32)
     )
     encoder = params(state.policies).encoder
-    heads = [*float64(state.heads), params(state.policies).head]
+    heads = float64(state.heads)
     pevfa = float64(state.critics.pevfa.params)
     expected = []
     for at, head in zip(states, heads, strict=True):

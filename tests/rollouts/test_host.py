@@ -129,12 +129,12 @@ def test_beginnings_of_episodes():
     """Of two steps: team 0 ends with its second, the others go on; worked out by hand."""
     with EnvPool(countdown_task(), 3, processes=False) as pool:
         rollout = collect(pool, zeros, SEEDS)
-    found = beginnings(rollout, 2, 0.5)
+    found = beginnings(rollout, 3, 2, 0.5)
     assert found.rewards.tolist() == [1 + 0.5 * 2, 21 + 0.5 * 22, 11 + 0.5 * 12]
     assert found.weight.tolist() == [0, 0.25, 0.25]
     assert found.state.tolist() == [[0, 2], [2, 2], [1, 2]]
     # Of more than there are: what there is.
-    found = beginnings(rollout, 4, 0.5)
+    found = beginnings(rollout, 3, 4, 0.5)
     assert found.rewards[0] == 2
     assert found.rewards[2] == 11 + 6 + 13 / 4
     assert found.weight.tolist() == [0, 0, 0.125]
