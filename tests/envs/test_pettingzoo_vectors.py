@@ -125,6 +125,11 @@ def test_masks_of_parts_make_masks_of_joint_choices() -> None:
     choices = Choices(space, "it")
     for bits in itertools.product([0, 1], repeat=5):
         parts = (np.array(bits[:2], np.int8), np.array(bits[2:], np.int8))
+        if not (any(bits[:2]) and any(bits[2:])):
+            for nothing in (parts, np.array(bits)):
+                with pytest.raises(HandedOverError, match="leaves no action"):
+                    choices.available(nothing)
+            continue
         found = choices.available(parts)
         np.testing.assert_array_equal(found, choices.available(np.array(bits)))
         allowed = {tuple(choices.action(n).tolist()) for n in np.flatnonzero(found).tolist()}
