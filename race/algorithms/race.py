@@ -32,7 +32,7 @@ from race.algorithms.race_update import (
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
-from race.networks.optimization import copy, init_trainable
+from race.networks.optimization import copy, init_trainable, parameters
 from race.types import Spec, Team
 
 
@@ -102,21 +102,11 @@ def update(
     """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
     learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
-    encoder, head = state.policies.encoder.params, state.policies.head.params
-    team, climbing = draw_teams(state.heads, head, team_key, spec, shape)
+    policies = parameters(state.policies)
+    team, climbing = draw_teams(state.heads, policies.head, team_key, spec, shape)
     samples = learner.now(batch, spec)
     critics, critic_losses, value = train_critics(
-        state.critics,
-        state.target,
-        encoder,
-        head,
-        batch,
-        samples,
-        team,
-        critic_key,
-        spec,
-        shape,
-        hyper,
+        state.critics, state.target, policies, batch, samples, team, critic_key, spec, shape, hyper
     )
 
     def policy_step(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:

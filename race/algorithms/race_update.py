@@ -105,8 +105,7 @@ def draw_teams(
 def train_critics(
     critics: Critics,
     target: Targets,
-    encoder: Any,
-    head: Float[Array, "_ H1 A"],
+    policies: Policies,
     batch: Any,
     samples: Samples,
     team: Float[Array, "N H1 A"],
@@ -128,7 +127,7 @@ def train_critics(
     if shape.pevfa_target == "target":
         team_action = learner.target_action(z, team, later, team_key, spec, hyper)
     else:
-        online = learner.encode(encoder, later, spec)
+        online = learner.encode(policies.encoder, later, spec)
         as_it_is = hyper._replace(smoothing_noise=0.0)
         team_action = learner.target_action(online, team, later, team_key, spec, as_it_is)
     marl_next = _marl_values(
@@ -142,7 +141,7 @@ def train_critics(
 
     def loss(critics: Critics) -> tuple[Float[Array, ""], tuple[Losses, Float[Array, "B"]]]:
         value = learner.state_values(critics.value, now)
-        q_marl = _marl_values(critics.critic, critics.pevfa, now, taken, head, spec, shape)
+        q_marl = _marl_values(critics.critic, critics.pevfa, now, taken, policies.head, spec, shape)
         losses = {
             "critic": td_loss(q_marl, y_marl, mask),
             "pevfa": td_loss(learner.q_team(critics.pevfa, now, taken, team, spec), y_team, mask),

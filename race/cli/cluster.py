@@ -17,11 +17,11 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, NamedTuple, final
 
 from race.cli.carried import STOP, begun, carry_out
 from race.cli.worker import INTERRUPTED, LOST
+from race.closing import Closing
 from race.compilation import cores
 from race.config.cohort import Batching
 from race.errors import ConfigError, RaceError
@@ -69,7 +69,7 @@ def check_address(on: str) -> None:
 
 
 @final
-class Cluster:
+class Cluster(Closing):
     """A connection to a cluster; a context that ends what it has sent.
 
     Attributes:
@@ -135,15 +135,8 @@ class Cluster:
             self._looked = time.monotonic()
         return self._nodes
 
-    def __enter__(self) -> "Cluster":
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """Ends what has been sent, and leaves the cluster."""
         for task in self._sent:
             if not task.ended:
                 task.end()

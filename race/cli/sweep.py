@@ -1,6 +1,5 @@
 """``race sweep``."""
 
-import dataclasses
 import os
 import re
 import tomllib
@@ -163,11 +162,8 @@ def create_runs(
 
 def unlike(there: Any, asked: Any) -> str:
     """The settings in which two runs differ, with both values."""
-    found = []
-    for group, value in dataclasses.asdict(there).items():
-        other = dataclasses.asdict(asked)[group]
-        pairs = {group: (value, other)}
-        if isinstance(value, dict):
-            pairs = {f"{group}.{name}": (value[name], other[name]) for name in value}
-        found += [f"{name} {a}, asked: {b}" for name, (a, b) in pairs.items() if a != b]
-    return "; ".join(found)
+    from race.config.saved import flat, to_json
+
+    others = flat(to_json(asked))
+    pairs = ((name, value, others[name]) for name, value in flat(to_json(there)).items())
+    return "; ".join(f"{name} {a}, asked: {b}" for name, a, b in pairs if a != b)

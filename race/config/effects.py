@@ -112,6 +112,7 @@ _DEFAULTS: dict[str, Any] = {
 def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
     yield from _idle_of_population(asked)
+    yield from _idle_of_pevfa(asked, task.discrete)
     yield from _idle_of_learner(asked, task.discrete)
     if not task.reads_env:
         why = f"on {asked.task}, whose agents observe what they do in any case"
@@ -151,9 +152,8 @@ def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
             yield from ((f"race.{name}", why) for name in settings)
 
 
-def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
-    evolves, algo = asked.has_population, asked.algo
-    base = asked.base or ("facmac" if discrete else "matd3") if evolves else algo
+def _idle_of_pevfa(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
+    base = _base(asked, discrete)
     if base != "matd3":
         yield "race.policy_embedding", f"with {base}, whose PeVFA is one critic"
     if discrete:
@@ -161,6 +161,17 @@ def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]
         yield from ((f"race.{name}", why) for name in _SURROGATE)
     elif asked.race.surrogate_probability == 0:
         yield "race.surrogate_steps", "with --race.surrogate-probability 0"
+
+
+def _base(asked: Config, discrete: bool) -> str:
+    """The gradient learner that is asked for, or that there is where none is."""
+    if not asked.has_population:
+        return asked.algo
+    return asked.base or ("facmac" if discrete else "matd3")
+
+
+def _idle_of_learner(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
+    evolves, algo, base = asked.has_population, asked.algo, _base(asked, discrete)
     if not evolves and asked.base != algo:
         yield "base", f"with --algo {algo}, which is its own gradient learner"
     if not asked.has_marl:

@@ -1,6 +1,7 @@
 """Configurations as JSON: written beside a run, and read back, older ones too."""
 
 import dataclasses
+from collections.abc import Mapping
 from types import UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -12,6 +13,15 @@ from race.errors import ConfigError
 def to_json(config: Any) -> dict[str, Any]:
     """A config as plain JSON values; `from_json` is its inverse."""
     return dataclasses.asdict(config)
+
+
+def flat(values: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    """Settings by names such as ``race.evolution``, from groups of them as `to_json` gives them."""
+    found: dict[str, Any] = {}
+    for name, value in values.items():
+        within = isinstance(value, Mapping)
+        found |= flat(value, f"{before}{name}.") if within else {f"{before}{name}": value}
+    return found
 
 
 # Settings that runs of older versions do not have in their files, and what these runs did.

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from race.config.effects import NETWORKS
+from race.config.saved import flat
 from race.config.settings import Config
 
 
@@ -56,11 +57,7 @@ def settings(config: Config) -> dict[str, Any]:
         for group, used in NETWORKS.items():
             if group in kept:
                 kept[group] = {name: kept[group][name] for name in used}
-    return {
-        f"{group}.{name}" if isinstance(values, dict) else group: value
-        for group, values in kept.items()
-        for name, value in (values.items() if isinstance(values, dict) else [("", values)])
-    }
+    return flat(kept)
 
 
 def experiment_key(config: Config, algorithm_version: int) -> str:

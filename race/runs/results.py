@@ -39,8 +39,10 @@ def of_directory(path: Path) -> Recorded:
     config, identity = run_directory.open_run(path), run_directory.identity_of(path)
     # Before the rows, which are the newer then and hold all that it knows of.
     kept = checkpoints.metrics_extent(run.checkpoints)
-    rows = metrics.read(run.metrics, identity, kept) if run.metrics.exists() else []
-    if kept is not None and not run.metrics.exists():
+    rows = []
+    if run.metrics.exists():
+        rows = metrics.read(run.metrics, identity, kept)
+    elif kept is not None:
         metrics.check_extent(run.metrics, b"", kept)  # none are there yet, or they are lost
     return Recorded(str(path), config, rows, run_directory.read_metadata(path), path)
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import dataclasses
-import types
 from pathlib import Path
 from typing import Any
 
@@ -196,12 +195,12 @@ def test_beginnings_of_episodes_may_judge_the_population(
     """Episodes of ten steps that pay 1 each, cut after three, at a discount of a half."""
     monkeypatch.setattr(learning, "CHUNK", 7)
     expected: list[np.ndarray] = []
+    asked = programs.expected
 
     def noting(*args: Any, **more: Any) -> np.ndarray:
-        expected.append(np.asarray(programs.expected(*args, **more), np.float64))
+        expected.append(np.asarray(asked(*args, **more), np.float64))
         return expected[-1]
 
-    judging = types.SimpleNamespace(**{**vars(programs), "expected": noting})
     config = small("race", "matd3", "probe/time-limit", surrogate_probability=0.5)
     config = dataclasses.replace(
         config,
@@ -211,7 +210,7 @@ def test_beginnings_of_episodes_may_judge_the_population(
         env=dataclasses.replace(config.env, reward_scale=2.0),
     )
     with monkeypatch.context() as patched:
-        patched.setattr(generation, "programs", judging)
+        patched.setattr(programs, "expected", noting)
         progress = run(tmp_path / "whole", config)
     generations = rows(tmp_path / "whole", "generation")
     assert progress.gradient_steps == progress.env_steps - progress.random_steps

@@ -41,7 +41,7 @@ class Logged:
     @property
     def settings(self) -> dict[str, Any]:
         """Every setting by its name, such as ``race.mutation_fraction``."""
-        return dict(_flat(configs.to_json(self.config)))
+        return configs.flat(configs.to_json(self.config))
 
 
 class Logger(Protocol):
@@ -77,13 +77,3 @@ def point_of(row: Mapping[str, Any]) -> Point:
         and math.isfinite(value)
     }
     return Point(int(row["env_steps"]), values.get("wall_seconds", 0.0), values)
-
-
-def _flat(values: Mapping[str, Any], before: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            found += _flat(value, f"{before}{name}.")
-        else:
-            found.append((f"{before}{name}", value))
-    return found
