@@ -175,7 +175,9 @@ class Cohort:
         width, first = len(self._runs), np.int32(0)
         shape = self._statics["shape"]
         batches = tuple(
-            cohort.minibatches(run.replay, key, first, room=STEPS_AS_ONE, shape=shape)
+            cohort.minibatches(
+                run.replay, key, first, hyper=run.hyper, room=STEPS_AS_ONE, shape=shape
+            )
             for run, key in zip(self._runs, self._keys, strict=True)
         )
         self._states, self._sums = cohort.learn(

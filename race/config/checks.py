@@ -182,6 +182,12 @@ def check(config: Config) -> None:
         ),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
+        (
+            race.own_share is None or 0 <= race.own_share <= 1,
+            "race.own-share",
+            race.own_share,
+            "from 0 to 1, or None for what the replay buffer holds",
+        ),
         *_population_rules(race),
         (
             config.whole_teams or race.vfm_marl_weight + race.vfm_team_weight + race.vmm_weight > 0,

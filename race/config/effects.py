@@ -28,7 +28,9 @@ _SHARED_ENCODERS = (
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
     *("pevfa_target", "policy_embedding", *_SURROGATE),
 )
-_BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
+_BESIDE_MARL = (
+    *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
+)
 _OF_EVOLUTIONS = {
     "ga": (
         *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),

@@ -30,6 +30,8 @@ class Hyper(NamedTuple):
     td_lambda: Number
     """lambda of FACMAC's targets on discrete actions."""
     last_layer_scale: Number
+    own_share: Number
+    """Of a minibatch; NaN where it is what the buffer holds."""
     mutation_fraction: Number
     """alpha"""
     mutation_probability: Number
@@ -96,10 +98,12 @@ def hyper_of(config: Config) -> Hyper:
     if config.whole_teams:
         idle |= {"vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"}
     if not config.has_marl:
-        idle |= {"injection_probability", *_OF_GRADIENTS}
+        idle |= {"injection_probability", "own_share", *_OF_GRADIENTS}
     if config.has_population:
         used = NUMBERS_OF_EVOLUTIONS.get(race.evolution, ())
         idle |= {name for of in NUMBERS_OF_EVOLUTIONS.values() for name in of if name not in used}
+    if race.own_share is None:
+        idle.add("own_share")
     numbers |= dict.fromkeys(idle, unused)
     if numbers["largest_weight"] is None:
         numbers["largest_weight"] = float("inf")

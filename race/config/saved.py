@@ -67,6 +67,8 @@ _BEFORE: dict[str, Any] = {
     "es_learning_rate": 0.02,
     "marl_episodes": 1,
     "evolution_from": 0,
+    "own_share": None,
+    "replayed": "all",
     "random_steps_owed": False,
     "compute": ComputeConfig(),
     "keep_best": 0,

@@ -22,6 +22,7 @@ TeamDraw = Literal["once", "each"]
 PevfaTarget = Literal["target", "online"]
 PolicyEmbedding = Literal["shared", "each"]
 EVOLUTIONS = ("ga", "cem", "es")
+Replayed = Literal["all", "better"]
 TeamName = Literal["marl", "champion", "selected"]
 TeamReward = Literal["mean", "sum"]
 StateSource = Literal["auto", "environment", "observations"]
@@ -208,6 +209,12 @@ class RaceConfig:
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
+    own_share: float | None = None
+    """Share of a minibatch that is the MARL team's own experience; the rest is others', random
+    steps among them. None: what the replay buffer holds, about a sixth with five teams."""
+    replayed: Replayed = "all"
+    """Whose experience of a generation goes into the replay buffer: that of all teams, or, of the
+    population, of the better ones alone, which returned no less than its median."""
     surrogate_probability: float = 0.0
     """Probability that a generation judges the population by the beginnings of its episodes and
     what the PeVFA expects after them, as the code does that the paper's evolution is taken from;
@@ -359,6 +366,11 @@ class Config:
         if not self.has_marl:
             return 0
         return self.race.marl_episodes if self.has_population else 1
+
+    @property
+    def tells_own(self) -> bool:
+        """Whether the replay buffer tells the MARL team's experience from others'."""
+        return self.has_population and self.race.own_share is not None
 
     @property
     def n_teams(self) -> int:

@@ -20,7 +20,15 @@ from race.config.shape import Shape
 from race.learners import LEARNERS
 from race.method.normalisation import Scaling, scaled
 from race.networks.dense import act_teams
-from race.replay.buffer import Layout, Replay, distinct_places, insert, sample, slots_of
+from race.replay.buffer import (
+    Layout,
+    Replay,
+    distinct_places,
+    insert,
+    sample,
+    slots_of,
+    sources_of,
+)
 from race.replay.shown import as_shown
 from race.types import EnvSpec, Spec, Team
 
@@ -67,13 +75,14 @@ def learn(
         The state and ``sums`` with the steps' losses added.
     """
     TRACES["learn"] += 1
+    sources = sources_of(replay)
 
     def body(i: Int[Array, ""], carry: tuple[Any, Losses]) -> tuple[Any, Losses]:
         state, sums = carry
         step = first_step + i
         sample_key, update_key = jax.random.split(jax.random.fold_in(key, step))
         if layouts is None:
-            batch = sample(replay, shape.batch_size, sample_key)
+            batch = sample(replay, shape.batch_size, sample_key, hyper.own_share, sources)
         else:
             batch = slots_of(replay, jax.tree.map(lambda column: column[i], layouts))
         batch = as_shown(batch, scaling)
@@ -91,6 +100,7 @@ def draw(
     first_step: Int[Array, ""],
     n_steps: Int[Array, ""],
     *,
+    hyper: Hyper,
     room: int,
     shape: Shape,
 ) -> tuple[Int[Array, "room B"], Int[Array, "room B"]]:
@@ -103,7 +113,8 @@ def draw(
 
     def body(i: Int[Array, ""], places: Int[Array, "room B"]) -> Int[Array, "room B"]:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        return places.at[i].set(distinct_places(replay, shape.batch_size, sample_key))
+        drawn = distinct_places(replay, shape.batch_size, sample_key, hyper.own_share)
+        return places.at[i].set(drawn)
 
     places = jnp.zeros((room, shape.batch_size), jnp.int32)
     places = jax.lax.fori_loop(0, n_steps, body, places)
@@ -163,10 +174,12 @@ def _inject(population: Population, team: Team, key: PRNGKeyArray, *, hyper: Hyp
 
 
 @partial(jax.jit, donate_argnames="replay")
-def store(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
-    """Writes the first ``count`` of some transitions or episodes."""
+def store(
+    replay: Replay, rows: Any, count: Int[Array, ""], own: Bool[Any, "R"] | None = None
+) -> Replay:
+    """Writes the first ``count`` of some transitions or episodes; ``own``: the MARL team's."""
     TRACES["store"] += 1
-    return insert(replay, rows, count)
+    return insert(replay, rows, count, own)
 
 
 @partial(jax.jit, static_argnames=("spec", "base"))

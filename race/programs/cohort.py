@@ -17,7 +17,7 @@ from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.method.normalisation import Scaling
 from race.programs import TRACES, joint_actions
-from race.replay.buffer import Layout, Replay, sample, slots_of
+from race.replay.buffer import Layout, Replay, sample, slots_of, sources_of
 from race.replay.shown import as_shown
 from race.types import EnvSpec, Slots, Spec
 
@@ -37,6 +37,7 @@ def minibatches(
     key: PRNGKeyArray,
     first_step: Int[Any, ""],
     *,
+    hyper: Hyper,
     room: int,
     shape: Shape,
     scaling: Scaling | None = None,
@@ -46,10 +47,12 @@ def minibatches(
     They are those that `race.programs.learn` would draw.
     """
     TRACES["minibatches"] += 1
+    sources = sources_of(replay)
 
     def one(i: Int[Array, ""]) -> Any:
         sample_key, _ = jax.random.split(jax.random.fold_in(key, first_step + i))
-        return as_shown(sample(replay, shape.batch_size, sample_key), scaling)
+        drawn = sample(replay, shape.batch_size, sample_key, hyper.own_share, sources)
+        return as_shown(drawn, scaling)
 
     return jax.vmap(one)(jnp.arange(room))
 

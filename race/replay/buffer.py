@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from race.types import Episode, Slots
 
@@ -17,6 +17,7 @@ class Replay(NamedTuple):
 
     data: Any  # a NamedTuple of columns, leading axis: capacity
     inserted: Int[Array, ""]  # items ever inserted
+    own: Bool[Array, "capacity"] | None = None  # made by the MARL team; None: nobody asks
 
     @property
     def capacity(self) -> int:
@@ -24,17 +25,24 @@ class Replay(NamedTuple):
         return int(jax.tree.leaves(self.data)[0].shape[0])
 
 
-def init_replay(item: Any, capacity: int) -> Replay:
-    """An empty buffer for items of the shapes and dtypes of ``item``."""
+def init_replay(item: Any, capacity: int, owned: bool = False) -> Replay:
+    """An empty buffer for items of the shapes and dtypes of ``item``.
+
+    ``owned``: it remembers which items the MARL team made.
+    """
     data = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), item)
-    return Replay(data, jnp.zeros((), jnp.int32))
+    own = jnp.zeros(capacity, bool) if owned else None
+    return Replay(data, jnp.zeros((), jnp.int32), own)
 
 
-def insert(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
+def insert(
+    replay: Replay, rows: Any, count: Int[Array, ""], own: Bool[Array, "R"] | None = None
+) -> Replay:
     """Appends the first ``count`` of ``rows``, over the oldest items once full.
 
     ``rows`` has a fixed length (no longer than the capacity), so that one compiled program serves
-    rollouts of any length.
+    rollouts of any length. ``own``: which the MARL team made, where the buffer remembers; None:
+    none of them.
     """
     capacity = replay.capacity
     offsets = jnp.arange(jax.tree.leaves(rows)[0].shape[0], dtype=jnp.int32)
@@ -43,20 +51,100 @@ def insert(replay: Replay, rows: Any, count: Int[Array, ""]) -> Replay:
     data = jax.tree.map(
         lambda column, new: column.at[places].set(new, mode="drop"), replay.data, rows
     )
-    return Replay(data, replay.inserted + count)
+    remembered = replay.own
+    if remembered is not None:
+        made = jnp.zeros(len(offsets), bool) if own is None else own
+        remembered = remembered.at[places].set(made, mode="drop")
+    return Replay(data, replay.inserted + count, remembered)
 
 
-def sample(replay: Replay, batch_size: int, key: PRNGKeyArray) -> Any:
-    """A minibatch drawn uniformly, with replacement, from what is stored."""
-    places = jax.random.randint(key, (batch_size,), 0, _filled(replay))
+class Sources(NamedTuple):
+    """Who made what is stored: how many of the first items the MARL team did, and others did."""
+
+    own: Int[Array, "capacity"]
+    others: Int[Array, "capacity"]
+
+
+def sources_of(replay: Replay) -> Sources | None:
+    """What `sample` needs to tell them apart, once for many minibatches; None: it need not."""
+    if replay.own is None:
+        return None
+    taken = _taken(replay)
+    counts = (jnp.cumsum(taken & made, dtype=jnp.int32) for made in (replay.own, ~replay.own))
+    return Sources(*counts)
+
+
+def sample(
+    replay: Replay,
+    batch_size: int,
+    key: PRNGKeyArray,
+    own_share: Float[Any, ""] | float = 0.0,
+    sources: Sources | None = None,
+) -> Any:
+    """A minibatch drawn uniformly, with replacement, from what is stored.
+
+    With ``sources``, the nearest number to ``own_share`` of it are items that the MARL team made
+    and the rest others', each drawn uniformly; where there are none of a kind, all are of the
+    other.
+    """
+    if sources is None:
+        places = jax.random.randint(key, (batch_size,), 0, _filled(replay))
+    else:
+        n_own = jnp.where(sources.own[-1] > 0, _wanted(batch_size, own_share), 0)
+        n_own = jnp.where(sources.others[-1] > 0, n_own, batch_size)
+        own, others = (
+            _places_of(counts, batch_size, one)
+            for counts, one in zip(sources, jax.random.split(key), strict=True)
+        )
+        places = jnp.where(jnp.arange(batch_size) < n_own, own, others)
     return jax.tree.map(lambda column: column[places], replay.data)
 
 
-def distinct_places(replay: Replay, batch_size: int, key: PRNGKeyArray) -> Int[Array, "B"]:
-    """Places of a minibatch drawn uniformly, without replacement; there must be that many."""
-    lots = jax.random.uniform(key, (replay.capacity,))
-    taken = jnp.arange(replay.capacity, dtype=jnp.int32) < _filled(replay)
-    return jax.lax.top_k(jnp.where(taken, lots, -1.0), batch_size)[1].astype(jnp.int32)
+def _wanted(batch_size: int, share: Float[Any, ""] | float) -> Int[Array, ""]:
+    return jnp.round(jnp.asarray(share) * batch_size).astype(jnp.int32)
+
+
+def _places_of(counts: Int[Array, "capacity"], n: int, key: PRNGKeyArray) -> Int[Array, "n"]:
+    """Places of ``n`` of the items that raise ``counts``, uniformly, with replacement."""
+    rank = jax.random.randint(key, (n,), 0, jnp.maximum(counts[-1], 1))
+    return jnp.searchsorted(counts, rank, side="right").astype(jnp.int32)
+
+
+def distinct_places(
+    replay: Replay, batch_size: int, key: PRNGKeyArray, own_share: Float[Any, ""] | float = 0.0
+) -> Int[Array, "B"]:
+    """Places of a minibatch drawn uniformly, without replacement; there must be that many.
+
+    Where the buffer remembers who made what, the nearest number to ``own_share`` of them are of
+    the MARL team, or as near to it as what there is allows.
+    """
+    lots, taken = jax.random.uniform(key, (replay.capacity,)), _taken(replay)
+    if replay.own is None:
+        return _highest(lots, taken, batch_size)
+    own, others = taken & replay.own, taken & ~replay.own
+    n_own = _wanted(batch_size, own_share)
+    n_own = jnp.clip(n_own, batch_size - jnp.sum(others), jnp.sum(own))
+    turn = jnp.arange(batch_size, dtype=jnp.int32)
+    first, rest = (_highest(lots, kind, batch_size) for kind in (own, others))
+    return jnp.where(turn < n_own, first, rest[jnp.maximum(turn - n_own, 0)])
+
+
+def _highest(
+    lots: Float[Array, "capacity"], among: Bool[Array, "capacity"], count: int
+) -> Int[Array, "count"]:
+    return jax.lax.top_k(jnp.where(among, lots, -1.0), count)[1].astype(jnp.int32)
+
+
+def columns(replay: Replay) -> dict[str, Any]:
+    """All that is kept of the items, by name."""
+    own = {} if replay.own is None else {"own": replay.own}
+    return replay.data._asdict() | own
+
+
+def with_columns(replay: Replay, found: dict[str, Any], inserted: int) -> Replay:
+    """A buffer of the same shapes with other `columns`."""
+    data = replay.data._replace(**{name: found[name] for name in replay.data._fields})
+    return Replay(data, jnp.asarray(inserted, jnp.int32), found.get("own"))
 
 
 class Layout(NamedTuple):
@@ -93,6 +181,10 @@ def slots_of(replay: Replay, layout: Layout) -> Slots:
         real=real,
         moment=layout.place * data.obs.shape[1] + time,
     )
+
+
+def _taken(replay: Replay) -> Bool[Array, "capacity"]:
+    return jnp.arange(replay.capacity, dtype=jnp.int32) < _filled(replay)
 
 
 def _filled(replay: Replay) -> Int[Array, ""]:

@@ -85,6 +85,8 @@ class Generation(NamedTuple):
     env_steps: int
     repeated: int
     """Episodes that were begun anew because an environment failed."""
+    stored: int
+    """Episodes that went into the buffer, or a part of them did."""
     observed: Observed | None = None
     """What all teams saw, where observations are normalised."""
     beginnings: Beginnings | None = None
@@ -156,6 +158,18 @@ class Rollouts(Protocol):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None: ...
+
+
+def keepers(episode_return: Float[Any, "T"], play: Play) -> NDArray[np.bool_]:
+    """Whose episodes go into the buffer, [T]: the MARL team's, and those of the population.
+
+    Of the population all, or the better half: those that returned no less than its median.
+    """
+    kept = np.ones(play.teams.count, bool)
+    population = np.asarray(episode_return)[: play.teams.count - play.n_marl]
+    if play.config.race.replayed == "better" and population.size:
+        kept[: population.size] = population >= np.median(population)
+    return kept
 
 
 def check_returns(episode_return: Float[Any, "T"], where: str) -> None:

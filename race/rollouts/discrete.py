@@ -17,12 +17,21 @@ from race.method.exploration import epsilon
 from race.randomness import Purpose, host_seeds, root_key
 from race.replay.buffer import Replay, init_replay
 from race.rollouts import device
-from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp, check_returns
+from race.rollouts.base import (
+    Generation,
+    Play,
+    Score,
+    Steps,
+    Trial,
+    WarmUp,
+    check_returns,
+    keepers,
+)
 from race.rollouts.choosing import Exploration
 from race.rollouts.episodes import Part, Played, empty_episode, seen_in
 from race.rollouts.host_episodes import HostEnvs
 from race.rollouts.pool import EnvPool
-from race.types import DiscreteTask
+from race.types import DiscreteTask, Episode
 
 TESTS_AT_ONCE = 32
 """Test episodes of a team in one program; a program serves one number of them only."""
@@ -77,7 +86,8 @@ class EpisodeRollouts(Closing):
         facmac = config.facmac
         most = max(config.env_steps + config.n_teams, facmac.batch_size)
         item = empty_episode(self._spec, str(facmac.replay_precision))
-        return init_replay(item, min(facmac.replay_capacity, most) * config.has_marl)
+        capacity = min(facmac.replay_capacity, most) * config.has_marl
+        return init_replay(item, capacity, config.tells_own)
 
     def warm_up(
         self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
@@ -97,15 +107,14 @@ class EpisodeRollouts(Closing):
                 results.append(error)
                 continue
             replay = play.replay
-            if replay.capacity:
-                episodes, scale = played.episodes, play.config.env.reward_scale
-                if scale != 1:  # returns stay in the task's own units
-                    episodes = episodes._replace(reward=episodes.reward * np.float32(scale))
-                replay = programs.store(replay, episodes, np.int32(play.teams.count))
             returns = np.asarray(played.episode_return, np.float64)
+            kept = keepers(returns, play)
+            if replay.capacity:
+                replay = _with_episodes(replay, played.episodes, kept, play)
             steps = int(np.sum(played.episodes.length))
             observed = seen_in(played.episodes) if play.config.env.normalise else None
-            results.append((replay, Generation(returns, steps, now - before, observed)))
+            made = Generation(returns, steps, now - before, int(kept.sum()), observed)
+            results.append((replay, made))
             before = now
         return results
 
@@ -200,6 +209,20 @@ def _small(seeds: NDArray[np.int64]) -> NDArray[np.uint32]:
 def _seeds(play: Play) -> NDArray[np.uint32]:
     seed, count = play.config.seed, play.teams.count
     return _small(host_seeds(seed, Purpose.ROLLOUT, play.generation, count))
+
+
+def _with_episodes(
+    replay: Replay, episodes: Episode, kept: NDArray[np.bool_], play: Play
+) -> Replay:
+    """The buffer with the episodes of those teams whose experience is kept."""
+    scale, teams = play.config.env.reward_scale, np.arange(play.teams.count)
+    if scale != 1:  # returns stay in the task's own units
+        episodes = episodes._replace(reward=episodes.reward * np.float32(scale))
+    if not kept.all():  # the first ones are written
+        teams = np.argsort(~kept, kind="stable")
+        episodes = jax.tree.map(lambda column: column[teams], episodes)
+    own = None if replay.own is None else teams >= play.teams.count - play.n_marl
+    return programs.store(replay, episodes, np.int32(kept.sum()), own)
 
 
 def _exploration(play: Play) -> Exploration | None:

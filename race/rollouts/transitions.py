@@ -16,7 +16,7 @@ from race.method.normalisation import Observed, observed_more, running_of
 from race.programs import cohort
 from race.randomness import Purpose, host_seeds
 from race.replay.buffer import Replay, init_replay
-from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp
+from race.rollouts.base import Generation, Play, Score, Steps, Trial, WarmUp, keepers
 from race.rollouts.beginnings import beginnings
 from race.rollouts.host import collect
 from race.rollouts.pool import EnvPool
@@ -84,7 +84,7 @@ class TransitionRollouts(Closing):
         longest += teams * self._task.spec.episode_limit
         capacity = min(learner.replay_capacity, max(longest, programs.INSERT_ROWS))
         capacity *= config.has_marl
-        return init_replay(empty_transition(self._task.spec), capacity)
+        return init_replay(empty_transition(self._task.spec), capacity, config.tells_own)
 
     def warm_up(
         self, config: Config, replay: Replay, report: Steps, interrupted: Callable[[], bool]
@@ -127,18 +127,18 @@ class TransitionRollouts(Closing):
             if isinstance(played, DivergenceError):
                 results.append(played)
                 continue
-            replay = play.replay
+            replay, kept = play.replay, keepers(played.episode_return, play)
             if replay.capacity:
-                scale = play.config.env.reward_scale
-                replay = store(replay, scaled(played.transitions, scale))
+                replay = _with_steps(replay, played, kept, play)
             steps, repeated = len(played.transitions.reward), int(played.repeated.sum())
+            stored = int(kept.sum())
             observed = seen_by(played, play.config)
             begun = None
             if play.beginnings is not None:
                 population = play.teams.count - play.n_marl
                 discount = play.config.learner.discount
                 begun = beginnings(played, population, play.beginnings, discount)
-            made = Generation(played.episode_return, steps, repeated, observed, begun)
+            made = Generation(played.episode_return, steps, repeated, stored, observed, begun)
             results.append((replay, made))
         return results
 
@@ -271,14 +271,32 @@ def scaled(transitions: Transition, scale: float) -> Transition:
     return transitions._replace(reward=transitions.reward * np.float32(scale))
 
 
-def store(replay: Replay, transitions: Transition) -> Replay:
-    """Appends transitions of any number, in pieces of one size."""
+def _with_steps(replay: Replay, played: Rollout, kept: NDArray[np.bool_], play: Play) -> Replay:
+    """The buffer with the steps of those teams whose experience is kept."""
+    rows: Any = slice(None)
+    if not kept.all():
+        rows = np.flatnonzero(kept[played.team])
+    steps = Transition(*(column[rows] for column in played.transitions))
+    own = played.team[rows] >= play.teams.count - play.n_marl
+    return store(replay, scaled(steps, play.config.env.reward_scale), own)
+
+
+def store(replay: Replay, transitions: Transition, own: NDArray[np.bool_] | None = None) -> Replay:
+    """Appends transitions of any number, in pieces of one size.
+
+    ``own``: which the MARL team made, [steps]; None: none of them.
+    """
     size = min(programs.INSERT_ROWS, replay.capacity)
+    if replay.own is None:
+        own = None
+    elif own is None:
+        own = np.zeros(len(transitions.reward), bool)
     for first in range(0, len(transitions.reward), size):
         piece = Transition(*(column[first : first + size] for column in transitions))
         count = len(piece.reward)
         padded = Transition(
             *(np.pad(c, [(0, size - count), *[(0, 0)] * (c.ndim - 1)]) for c in piece)
         )
-        replay = programs.store(replay, padded, np.int32(count))
+        of_marl = None if own is None else np.pad(own[first : first + size], (0, size - count))
+        replay = programs.store(replay, padded, np.int32(count), of_marl)
     return replay

@@ -85,6 +85,7 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
         episodes=progress.episodes + len(returns),
+        stored=progress.stored + played.stored,
         gradient_steps_before=progress.gradient_steps,
         generation=progress.generation + 1,
         fitness=tuple(fitness),
@@ -139,7 +140,8 @@ def owed(config: Config, progress: Progress) -> int:
         return 0
     if config.discrete:
         # From the first full minibatch on.
-        learned_from = max(progress.episodes - config.facmac.batch_size + 1, 0)
+        batch_size = config.facmac.batch_size
+        learned_from = progress.episodes - batch_size + 1 if progress.stored >= batch_size else 0
         due = math.floor(learned_from * config.facmac.gradient_steps_per_episode)
     else:
         random = 0 if config.learner.random_steps_owed else progress.random_steps

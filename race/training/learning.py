@@ -80,6 +80,7 @@ def learn_together(
                 state.replay,
                 key,
                 first,
+                hyper=state.hyper,
                 room=_chunk(run),
                 shape=run.statics["shape"],
                 scaling=state.scaling,
@@ -132,7 +133,9 @@ def _minibatches(run: Run, state: RunState, key: PRNGKeyArray) -> tuple[int, Lay
     room = _room(run)
     count = min(room, owed(run.config, state.progress))
     first, shape = np.int32(state.progress.gradient_steps), run.statics["shape"]
-    drawn = programs.draw(state.replay, key, first, np.int32(count), room=room, shape=shape)
+    drawn = programs.draw(
+        state.replay, key, first, np.int32(count), hyper=state.hyper, room=room, shape=shape
+    )
     places, lengths = (np.asarray(column)[:count] for column in drawn)
     return count, layouts(places, lengths, run.task.spec.episode_limit, room)
 

@@ -29,6 +29,8 @@ class Progress:
     gradient_steps: int = 0
     episodes: int = 0
     """Episodes of all teams, without those of the warm-up."""
+    stored: int = 0
+    """Those of them that went into the replay buffer."""
     generation: int = 0
     """Generations begun."""
     learning: bool = False

@@ -17,7 +17,7 @@ from race.method.normalisation import Observed, nothing_observed
 from race.networks.optimization import copy
 from race.programs import empty_losses, start
 from race.randomness import Purpose, root_key
-from race.replay.buffer import Replay
+from race.replay.buffer import Replay, columns, with_columns
 from race.runs import checkpoints
 from race.runs.checkpoints import SEGMENT_ROWS, Checkpoint, Rows
 from race.runs.metrics import Extent
@@ -59,8 +59,8 @@ def _contents(
 ) -> tuple[dict[str, Any], dict[str, Any], dict[str, Rows]]:
     """What `race.runs.checkpoints.save` takes: arrays, info, rows."""
     replay = state.replay
-    columns = {name: np.asarray(column) for name, column in replay.data._asdict().items()}
-    rows = Rows(columns, int(replay.inserted), replay.capacity)
+    kept = {name: np.asarray(column) for name, column in columns(replay).items()}
+    rows = Rows(kept, int(replay.inserted), replay.capacity)
     held = {"algorithm": state.algorithm, "losses": state.losses}
     if state.observed is not None:
         held[_OBSERVED] = state.observed
@@ -249,12 +249,14 @@ def progress_of(saved: Checkpoint) -> Progress:
     """
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
-    # Runs of before they were there lack the last two.
-    if not isinstance(values, dict) or set(values) | {"repeated", "estimated"} != names:
+    # Runs of before they were there lack these.
+    later = {"repeated", "estimated", "stored"}
+    if not isinstance(values, dict) or set(values) | later != names:
         raise CheckpointError(
             f"The checkpoint {saved.path} was not written by this version of race: its record of "
             "the run's progress differs. Use the version named in metadata.json."
         )
+    values = {"stored": values["episodes"], **values}  # all of them went into the buffer then
     return Progress(**{**values, "fitness": tuple(values["fitness"])})
 
 
@@ -269,8 +271,8 @@ def _filled(saved: Checkpoint, replay: Replay) -> Replay:
             f"which does not go into the {capacity} that config.json asks for. Put "
             "replay_capacity back to what the run began with."
         )
-    columns = {}
-    for name, column in replay.data._asdict().items():
+    found = {}
+    for name, column in columns(replay).items():
         kept = rows.columns.get(name)
         if kept is None or kept.shape[1:] != column.shape[1:] or kept.dtype != column.dtype:
             raise CheckpointError(
@@ -281,5 +283,5 @@ def _filled(saved: Checkpoint, replay: Replay) -> Replay:
             larger = np.zeros(column.shape, column.dtype)
             larger[: rows.size] = kept[: rows.size]
             kept = larger
-        columns[name] = jnp.array(kept)
-    return Replay(replay.data._replace(**columns), jnp.asarray(rows.inserted, jnp.int32))
+        found[name] = jnp.array(kept)
+    return with_columns(replay, found, rows.inserted)

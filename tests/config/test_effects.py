@@ -36,6 +36,7 @@ OTHER: dict[str, Any] = {
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
+    **{"own_share": 0.5, "replayed": "better"},
 }
 SETTINGS = [
     (group, field.name)
@@ -68,7 +69,7 @@ def read_on_host(config: Config, group: str, name: str) -> bool:
     if group == "race":
         beside = config.has_population and config.has_marl
         return beside and (
-            name in ("marl_episodes", "evolution_from")
+            name in ("marl_episodes", "evolution_from", "replayed")
             or (name == "surrogate_probability" and not (config.discrete or config.whole_teams))
         )
     mine = group == ("facmac" if config.discrete else "learner")

@@ -294,17 +294,18 @@ def test_what_is_drawn_for_a_run_depends_on_it_alone() -> None:
     """Its minibatches in one program are those it draws alone."""
     import jax
 
+    from race.config.hyper import hyper_of
     from race.config.shape import shape_of
     from race.programs import cohort
     from race.replay.buffer import Replay, sample
     from race.types import Transition
 
-    shape = shape_of(continuous())
+    shape, hyper = shape_of(continuous()), hyper_of(continuous())
     numbers = jax.numpy.arange(30.0)
     columns = (numbers[:, None], numbers[:, None], numbers, numbers, numbers[:, None])
     replay = Replay(Transition(*columns), jax.numpy.int32(21))
     key = jax.random.key(5)
-    found = cohort.minibatches(replay, key, np.int32(4), room=3, shape=shape)
+    found = cohort.minibatches(replay, key, np.int32(4), hyper=hyper, room=3, shape=shape)
     for i in range(3):
         sample_key, _ = jax.random.split(jax.random.fold_in(key, 4 + i))
         expected = sample(replay, shape.batch_size, sample_key)

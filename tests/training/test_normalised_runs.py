@@ -187,7 +187,9 @@ def test_gradient_steps_see_the_buffer_normalised(tiny_spec: EnvSpec, together: 
         stored = Transition(*(jnp.asarray(c, jnp.float32) for c in columns))
         replay = Replay(stored, jnp.int32(64))
         if together:
-            drawn = cohort.minibatches(replay, key, first, room=4, shape=shape, scaling=how)
+            drawn = cohort.minibatches(
+                replay, key, first, hyper=hyper, room=4, shape=shape, scaling=how
+            )
             return {name: jnp.mean(x) for name, x in drawn._asdict().items()}
         zeros = programs.empty_losses(algorithm)
         statics: Any = {"algorithm": algorithm, "spec": tiny_spec, "shape": shape, "hyper": hyper}
