@@ -1,0 +1,99 @@
+"""What of a generation goes into the buffer, and what of it is the MARL team's, over whole runs."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_laws import POPULATION, check_resumption, small
+from whole_runs import rows, run
+
+from race.config.settings import Config
+from race.rollouts.base import Play, keepers
+from race.runs import checkpoints
+from race.training import generation, learning
+from race.training.run_state import Progress
+
+
+class Count:
+    """Of teams no more is asked."""
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+
+def of_teams(config: Config, count: int, n_marl: int) -> Play:
+    return Play(config, Count(count), n_marl, 0, 0, None)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("returns", "n_marl", "kept"),
+    [
+        ([3.0, 1.0, 2.0, 5.0, 4.0, -9.0], 1, [1, 0, 0, 1, 1, 1]),
+        ([3.0, 1.0, 2.0, 5.0, 4.0, 2.0], 0, [1, 0, 0, 1, 1, 0]),  # the median is 2.5
+        ([1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0], 2, [1, 1, 1, 0, 0, 1, 1]),
+        ([1.0, 1.0, 1.0], 1, [1, 1, 1]),
+        ([7.0], 1, [1]),  # the MARL team plays alone
+    ],
+)
+def test_of_the_population_the_better_half_is_kept(
+    returns: list[float], n_marl: int, kept: list[int]
+) -> None:
+    config = small("race", "matd3", "probe/terminates", replayed="better")
+    found = keepers(np.array(returns), of_teams(config, len(returns), n_marl))
+    assert found.tolist() == [bool(k) for k in kept]
+    everyone = small("race", "matd3", "probe/terminates")
+    assert keepers(np.array(returns), of_teams(everyone, len(returns), n_marl)).all()
+
+
+@pytest.mark.parametrize(
+    ("algo", "base", "task"), [("merl", "matd3", "probe/target"), ("race", "facmac", "probe/lives")]
+)
+def test_what_is_replayed_over_a_whole_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, base: str, task: str
+) -> None:
+    monkeypatch.setattr(learning, "CHUNK", 7)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
+    config = small(algo, base, task, own_share=0.5, replayed="better")
+    config = dataclasses.replace(config, env_steps=130)
+    progress = run(tmp_path / "whole", config)
+    newest = checkpoints.newest(tmp_path / "whole" / "checkpoints")
+    assert newest is not None
+    replay = checkpoints.load(newest).rows["replay"]
+    made = rows(tmp_path / "whole", "generation")
+    better = sum(
+        np.sum(fitness >= np.median(fitness))
+        for row in made
+        for fitness in [np.array([team["fitness"] for team in row["teams"]])]
+    )
+    assert progress.stored == better + len(made)
+    assert progress.stored < progress.episodes == (POPULATION + 1) * len(made)
+    own = replay.columns["own"][: replay.size]
+    if config.discrete:
+        assert replay.inserted == progress.stored
+        assert own.sum() == len(made)
+    else:
+        assert progress.gradient_steps == progress.env_steps - progress.random_steps
+        assert not own[: progress.random_steps].any()
+        # Every probe episode has a step at least; none of the MARL team's is lost.
+        assert len(made) <= own.sum() < replay.inserted - progress.random_steps
+    check_resumption(tmp_path, config)
+
+
+def test_the_share_decides_what_is_learned(tmp_path: Path) -> None:
+    """The same run but for the share: the first generation plays alike, what it learns differs."""
+    found: list[dict[str, Any]] = []
+    for share in (0.0, 1.0):
+        config = small("race", "matd3", "probe/target", own_share=share)
+        run(tmp_path / str(share), config)
+        found.append(rows(tmp_path / str(share), "generation")[0])
+    assert found[0]["marl/return"] == found[1]["marl/return"]
+    assert found[0]["loss/critic"] != found[1]["loss/critic"]
+
+
+def test_episodes_are_learned_from_when_a_minibatch_of_them_is_stored() -> None:
+    config = small("race", "facmac", "probe/lives", replayed="better")
+    progress = Progress(episodes=6, stored=2)
+    assert generation.owed(config, progress) == 0
+    assert generation.owed(config, progress.but(stored=3)) == 4
