@@ -177,6 +177,10 @@ def train_policies(
     critic = None if shape.one_pevfa else learner.first_critic(of_critics.critic)
     pevfa = learner.first_pevfa(of_critics.pevfa)
     weights = value_weights(value, mask, hyper.value_awareness)
+    episodes = None
+    if shape.vmm_reduction == "sum":
+        assert learner.episodes is not None
+        episodes = learner.episodes(now)
 
     def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
         z = learner.encode(policies.encoder, now, spec)
@@ -196,9 +200,11 @@ def train_policies(
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
         # held fixed. Both are the same numbers and are computed once.
         fixed_mine = jax.lax.stop_gradient(policies.mine)
-        signal = learner.mutual_information(fixed_mine, now, z, pairs_key)
-        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key)
-        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None))(weights, signal, mask)
+        signal = learner.mutual_information(fixed_mine, now, z, pairs_key, shape)
+        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key, shape)
+        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None, None))(
+            weights, signal, mask, episodes
+        )
         bound = jax.vmap(mutual_information_bound, in_axes=(0, None))(plain, mask)
         vfm = value_function_maximization_loss(q_marl, q_team, mask)
         # Encoders and MINEs, of which there are equally many, share no parameter among themselves:

@@ -22,11 +22,13 @@ _PARALLEL = (
     "largest_observation",
 )
 _SURROGATE = ("surrogate_probability", "surrogate_steps")
+_OF_EPISODES = ("vmm_reduction", "mine_negatives")
 _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
-    *("pevfa_target", "policy_embedding", *_SURROGATE),
+    *("pevfa_target", "policy_embedding", "utility_embedding", *_SURROGATE),
+    *_OF_EPISODES,
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
 _OF_EVOLUTIONS = {
@@ -156,11 +158,17 @@ def _idle_of_pevfa(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     base = _base(asked, discrete)
     if base != "matd3":
         yield "race.policy_embedding", f"with {base}, whose PeVFA is one critic"
+    if base != "facmac":
+        yield "race.utility_embedding", f"with {base}, whose PeVFA has no utilities"
     if discrete:
         why = f"on {asked.task}, whose actions are discrete"
         yield from ((f"race.{name}", why) for name in _SURROGATE)
-    elif asked.race.surrogate_probability == 0:
+        return
+    if asked.race.surrogate_probability == 0:
         yield "race.surrogate_steps", "with --race.surrogate-probability 0"
+    why = f"on {asked.task}, whose actions are continuous"
+    yield from ((f"race.{name}", f"{why}: minibatches hold no episodes") for name in _OF_EPISODES)
+    yield "race.population_actions", f"{why}: its policies leave nothing to chance"
 
 
 def _base(asked: Config, discrete: bool) -> str:

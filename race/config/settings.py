@@ -21,6 +21,10 @@ Selection = Literal["team", "agent"]
 TeamDraw = Literal["once", "each"]
 PevfaTarget = Literal["target", "online"]
 PolicyEmbedding = Literal["shared", "each"]
+UtilityEmbedding = Literal["team", "agent"]
+VmmReduction = Literal["mean", "sum"]
+MineNegatives = Literal["steps", "episodes"]
+PopulationActions = Literal["greedy", "sampled"]
 EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
 TeamReward = Literal["mean", "sum"]
@@ -204,8 +208,20 @@ class RaceConfig:
     like the MARL team's, or online, its actions as they are."""
     policy_embedding: PolicyEmbedding = "shared"
     """Whether the two critics of a PeVFA share a policy embedding or have one each."""
+    utility_embedding: UtilityEmbedding = "team"
+    """What FACMAC's PeVFA tells the utility of an agent of a team's policies: the embedding of the
+    team, or that of the agent's own. Its mixer sees the team's (Appendix A.1)."""
+    vmm_reduction: VmmReduction = "mean"
+    """Whether Eq. (5) is the mean over the steps of a minibatch of episodes, or the mean over its
+    episodes of the sums over their steps: as much larger as episodes are long."""
+    mine_negatives: MineNegatives = "steps"
+    """What Eq. (3) contrasts an agent's embedding in an episode with: the same agent's at other
+    steps, of any episode, or those of all agents of other episodes at the same time of theirs."""
     one_pevfa: bool = False
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
+    population_actions: PopulationActions = "greedy"
+    """Discrete actions of the population in training: the policies' best, or sampled from the
+    policies, as the MARL team's are. In tests they are the best."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
     surrogate_probability: float = 0.0

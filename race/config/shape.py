@@ -6,11 +6,14 @@ from race.config.settings import (
     Base,
     Config,
     Level,
+    MineNegatives,
     MutationDraw,
     PevfaTarget,
     PolicyEmbedding,
     Selection,
     TeamDraw,
+    UtilityEmbedding,
+    VmmReduction,
 )
 
 
@@ -54,6 +57,9 @@ class Shape:
     marl_among_teams: bool
     pevfa_target: PevfaTarget
     policy_embedding: PolicyEmbedding
+    utility_embedding: UtilityEmbedding
+    vmm_reduction: VmmReduction
+    mine_negatives: MineNegatives
     one_pevfa: bool
     shared_agents: bool
 
@@ -100,6 +106,9 @@ def shape_of(config: Config) -> Shape:
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",
+        utility_embedding=race.utility_embedding if represents and mixes else "team",
+        vmm_reduction=race.vmm_reduction if represents and discrete else "mean",
+        mine_negatives=race.mine_negatives if represents and discrete else "steps",
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

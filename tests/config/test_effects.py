@@ -36,6 +36,8 @@ OTHER: dict[str, Any] = {
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
+    **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
+    **{"population_actions": "sampled"},
 }
 SETTINGS = [
     (group, field.name)
@@ -66,6 +68,8 @@ def refused(config: Config, **facts: bool) -> str:
 def read_on_host(config: Config, group: str, name: str) -> bool:
     """Settings that neither `Shape` nor `Hyper` shows."""
     if group == "race":
+        if name == "population_actions":
+            return config.has_population and config.discrete
         beside = config.has_population and config.has_marl
         return beside and (
             name in ("marl_episodes", "evolution_from")
