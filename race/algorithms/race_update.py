@@ -59,7 +59,7 @@ class Policies(NamedTuple):
 
 
 def of_all_agents(head: Float[Array, "_ H1 A"], spec: Spec) -> Float[Array, "N H1 A"]:
-    """The MARL team with a head for every agent, also where its agents share one."""
+    """A team with a head for every agent, also where its agents share one."""
     return jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
 
 
@@ -82,7 +82,7 @@ def _marl_values(
 
 
 def draw_teams(
-    heads: Float[Array, "P N H1 A"],
+    heads: Float[Array, "P _ H1 A"],
     marl_head: Float[Array, "_ H1 A"],
     key: PRNGKeyArray,
     spec: Spec,
@@ -94,8 +94,8 @@ def draw_teams(
     def team(key: PRNGKeyArray) -> Float[Array, "N H1 A"]:
         place = jax.random.randint(key, (), 0, n)
         if not shape.marl_among_teams:
-            return heads[place]
-        drawn = heads[jnp.minimum(place, n - 2)]
+            return of_all_agents(heads[place], spec)
+        drawn = of_all_agents(heads[jnp.minimum(place, n - 2)], spec)
         return jnp.where(place == n - 1, of_all_agents(marl_head, spec), drawn)
 
     first = team(key)

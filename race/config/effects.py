@@ -28,7 +28,7 @@ _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
     *("pevfa_target", "policy_embedding", "utility_embedding", *_SURROGATE),
-    *_OF_EPISODES,
+    *(*_OF_EPISODES, "team_heads"),
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
 _OF_EVOLUTIONS = {
@@ -113,7 +113,7 @@ _DEFAULTS: dict[str, Any] = {
 
 def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
-    yield from _idle_of_population(asked)
+    yield from _idle_of_population(asked, task.discrete)
     yield from _idle_of_pevfa(asked, task.discrete)
     yield from _idle_of_learner(asked, task.discrete)
     if not task.reads_env:
@@ -135,7 +135,7 @@ def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
         yield from ((f"env.{name}", why) for name in _HOST)
 
 
-def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
+def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     race = asked.race
     if not asked.has_population:
         why = f"with --algo {asked.algo}, which has no population"
@@ -145,6 +145,9 @@ def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
         own = f"with --algo {asked.algo}" if asked.algo != "race" else "with --race.no-sharing"
         names = [*_SHARED_ENCODERS, *["sharing"] * (asked.algo != "race")]
         yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
+    elif race.team_heads == "shared" and discrete:
+        why = "with --race.team-heads shared, where a team is one policy"
+        yield from ((f"race.{name}", why) for name in ("agent_mutation_probability", "selection"))
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)
@@ -169,6 +172,7 @@ def _idle_of_pevfa(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     why = f"on {asked.task}, whose actions are continuous"
     yield from ((f"race.{name}", f"{why}: minibatches hold no episodes") for name in _OF_EPISODES)
     yield "race.population_actions", f"{why}: its policies leave nothing to chance"
+    yield "race.team_heads", f"{why}: those of its agents are not the same"
 
 
 def _base(asked: Config, discrete: bool) -> str:

@@ -100,6 +100,8 @@ def hyper_of(config: Config) -> Hyper:
     if config.has_population:
         used = NUMBERS_OF_EVOLUTIONS.get(race.evolution, ())
         idle |= {name for of in NUMBERS_OF_EVOLUTIONS.values() for name in of if name not in used}
+    if config.one_head:
+        numbers["agent_mutation_probability"] = 1.0  # of a mutating team's only head
     numbers |= dict.fromkeys(idle, unused)
     if numbers["largest_weight"] is None:
         numbers["largest_weight"] = float("inf")

@@ -60,6 +60,7 @@ _BEFORE: dict[str, Any] = {
     "vmm_reduction": "mean",
     "mine_negatives": "steps",
     "population_actions": "greedy",
+    "team_heads": "agent",
     "one_pevfa": False,
     "sharing": True,
     "evolution": "ga",

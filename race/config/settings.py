@@ -25,6 +25,7 @@ UtilityEmbedding = Literal["team", "agent"]
 VmmReduction = Literal["mean", "sum"]
 MineNegatives = Literal["steps", "episodes"]
 PopulationActions = Literal["greedy", "sampled"]
+TeamHeads = Literal["agent", "shared"]
 EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
 TeamReward = Literal["mean", "sum"]
@@ -176,7 +177,8 @@ class RaceConfig:
     """Probability that an agent of a mutating team is picked (at least one is)."""
     crossover: Level | None = None
     """What two parents exchange: policies of agents, rows of whole teams with no regard to agents
-    (parameter), or rows of random layers. None: agent, with merl and ea layer."""
+    (parameter), or rows of random layers. None: agent, with merl and ea layer, where a team has one
+    head for all agents parameter."""
     mutation: Level | None = None
     """What a mutation draws its weights from: the policies of picked agents, whole teams with no
     regard to agents (parameter), or random layers. None: agent, with merl and ea layer."""
@@ -219,6 +221,9 @@ class RaceConfig:
     steps, of any episode, or those of all agents of other episodes at the same time of theirs."""
     one_pevfa: bool = False
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
+    team_heads: TeamHeads = "agent"
+    """Discrete actions: whether a team of the population has a head for each agent, or one through
+    which all of its agents act, as the MARL team does. A team is then one policy."""
     population_actions: PopulationActions = "greedy"
     """Discrete actions of the population in training: the policies' best, or sampled from the
     policies, as the MARL team's are. In tests they are the best."""
@@ -368,6 +373,12 @@ class Config:
     def whole_teams(self) -> bool:
         """Whether whole networks evolve instead of heads over shared encoders."""
         return self.has_population and not (self.algo == "race" and self.race.sharing)
+
+    @property
+    def one_head(self) -> bool:
+        """Whether all agents of a team of the population act through one head."""
+        evolves_heads = self.has_population and not self.whole_teams
+        return evolves_heads and self.discrete and self.race.team_heads == "shared"
 
     @property
     def n_marl_teams(self) -> int:

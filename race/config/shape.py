@@ -12,6 +12,7 @@ from race.config.settings import (
     PolicyEmbedding,
     Selection,
     TeamDraw,
+    TeamHeads,
     UtilityEmbedding,
     VmmReduction,
 )
@@ -60,6 +61,7 @@ class Shape:
     utility_embedding: UtilityEmbedding
     vmm_reduction: VmmReduction
     mine_negatives: MineNegatives
+    team_heads: TeamHeads
     one_pevfa: bool
     shared_agents: bool
 
@@ -101,7 +103,7 @@ def shape_of(config: Config) -> Shape:
         evolution=race.evolution if evolves else "ga",
         crossover=race.crossover if genetic and race.crossover else "agent",
         mutation=race.mutation if genetic and race.mutation else "agent",
-        selection=race.selection if genetic else "team",
+        selection=race.selection if genetic and not config.one_head else "team",
         team_draw=race.team_draw if represents else "once",
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
@@ -109,6 +111,7 @@ def shape_of(config: Config) -> Shape:
         utility_embedding=race.utility_embedding if represents and mixes else "team",
         vmm_reduction=race.vmm_reduction if represents and discrete else "mean",
         mine_negatives=race.mine_negatives if represents and discrete else "steps",
+        team_heads="shared" if config.one_head else "agent",
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

@@ -19,6 +19,7 @@ METHODS: list[tuple[dict[str, Any], bool]] = [
     ({"algo": "merl", "base": "facmac"}, False),
     *(({"race": RaceConfig(evolution=name)}, True) for name in ("cem", "es", "own:operator")),
     *(({"race": RaceConfig(sharing=False)}, discrete) for discrete in (False, True)),
+    ({"race": RaceConfig(team_heads="shared")}, True),
 ]
 ON_HOST = {
     False: {
@@ -37,7 +38,7 @@ OTHER: dict[str, Any] = {
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
     **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
-    **{"population_actions": "sampled"},
+    **{"population_actions": "sampled", "team_heads": "shared"},
 }
 SETTINGS = [
     (group, field.name)
@@ -93,6 +94,10 @@ def test_a_setting_is_refused_exactly_if_nothing_reads_it(
         value = other(name, getattr(settings, name))
         if name == "mutation_draw":  # methods differ in what they do where nothing is said
             value = "row" if resolved.race.mutation_draw == "weight" else "weight"
+        if (resolved.one_head, name) == (True, "crossover"):  # parameter is what it is
+            value = "layer"
+        if value == "shared" == getattr(settings, name):
+            value = "agent"
         assert value != getattr(settings, name)
         changed = dataclasses.replace(
             plain, **{group: dataclasses.replace(settings, **{name: value})}
