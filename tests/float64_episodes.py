@@ -131,9 +131,13 @@ def q_tot(
     state: np.ndarray,
     action: np.ndarray,
     pevfa: Any = None,
-    e: np.ndarray = NONE,
+    team: np.ndarray = NONE,
 ) -> np.ndarray:
-    """``Q_tot`` of steps ``[t]``; the policy embedding is one more input of both networks."""
+    """``Q_tot`` of steps ``[t]``; the policy embedding is one more input of both networks.
+
+    That of the team, or in an agent's utility of the agent's own head.
+    """
+    e = NONE if pevfa is None else policy_embedding(pevfa, team)
     net, mixer = critic.utilities, critic.mixer
     first, hyper = net.first.weight, mixer.first.weight
     if pevfa is not None:
@@ -142,7 +146,10 @@ def q_tot(
     steps, agents, _ = obs.shape
     q = np.empty((steps, agents))
     for i in range(agents):
-        x = np.concatenate([obs[:, i], action[:, i], np.tile(e, (steps, 1))], axis=1)
+        own = e
+        if pevfa is not None and pevfa.of_agents:
+            own = policy_embedding(pevfa, team[i : i + 1])
+        x = np.concatenate([obs[:, i], action[:, i], np.tile(own, (steps, 1))], axis=1)
         x = relu(normal(net, x @ first + net.first.bias))
         q[:, i] = dense(net.out, relu(normal(net, dense(net.hidden, x))))[:, 0]
     g, m = mixer.weights_out.weight.shape
@@ -193,13 +200,12 @@ def targets_of(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Both targets of Eq. (1), per episode."""
     y_marl, y_team = [], []
-    e = policy_embedding(target.pevfa, team)
     for one in episodes:
         u = best_actions(target.encoder, target.head, one)
         q = q_tot(target.critic, one.obs, one.state, u)
         y_marl.append(lambda_targets(one, q, discount, mixture))
         u = best_actions(target.encoder, team, one)
-        q = q_tot(target.pevfa.critic, one.obs, one.state, u, target.pevfa, e)
+        q = q_tot(target.pevfa.critic, one.obs, one.state, u, target.pevfa, team)
         y_team.append(lambda_targets(one, q, discount, mixture))
     return y_marl, y_team
 
@@ -218,8 +224,10 @@ def critic_loss(critic: Any, episodes: list[One], y: list[np.ndarray]) -> float:
 
 
 def pevfa_loss(pevfa: Any, team: np.ndarray, episodes: list[One], y: list[np.ndarray]) -> float:
-    e = policy_embedding(pevfa, team)
-    q = [q_tot(pevfa.critic, one.obs[:-1], one.state[:-1], one.taken, pevfa, e) for one in episodes]
+    q = [
+        q_tot(pevfa.critic, one.obs[:-1], one.state[:-1], one.taken, pevfa, team)
+        for one in episodes
+    ]
     return mean([(a - b) ** 2 for a, b in zip(q, y, strict=True)])
 
 
@@ -266,11 +274,10 @@ def policy_values(
     pevfa: Any = None,
 ) -> float:
     """``E_D[Q(s, pi(s))]`` of a team, of ``Q_theta`` if there is a PeVFA."""
-    e = NONE if pevfa is None else policy_embedding(pevfa, head)
     values = []
     for one, noise, hard, anchor in zip(episodes, *samples, strict=True):
         u = hard + softmax(perturbed(embeddings(encoder, one), head, one, noise)) - anchor
-        values.append(q_tot(critic, one.obs[:-1], one.state[:-1], u, pevfa, e))
+        values.append(q_tot(critic, one.obs[:-1], one.state[:-1], u, pevfa, head))
     return mean(values)
 
 
@@ -295,6 +302,28 @@ def signals(mine: Any, encoder: Any, episodes: list[One], groups: Any) -> list[n
                 others = [sp(score[m]) for m in living if m != (e, t)]
                 of_agents.append(-sp(-score[e, t]) - (np.mean(others) if others else 0.0))
             result[e][t] = np.mean(of_agents) if of_agents else 0.0
+    return result
+
+
+def signals_across(mine: Any, encoder: Any, episodes: list[One]) -> list[np.ndarray]:
+    """The same, with the embeddings of all agents of other episodes at that time as negatives."""
+    y = [dense(mine.embedding, embeddings(encoder, one)) for one in episodes]
+    x = [dense(mine.state_out, leaky(dense(mine.state_hidden, one.state))) for one in episodes]
+    result = []
+    for e, one in enumerate(episodes):
+        found = []
+        for t in range(one.length):
+
+            def scores(of: int, e: int = e, t: int = t) -> list[float]:
+                if t >= episodes[of].length:
+                    return []
+                living = episodes[of].available[t].sum(axis=-1) > 1
+                return [float(leaky(x[e][t]) @ y[of][t, i]) for i in np.flatnonzero(living)]
+
+            own = [-sp(-score) for score in scores(e)]
+            others = [sp(s) for of in range(len(episodes)) if of != e for s in scores(of)]
+            found.append(np.mean(own) - np.mean(others) if own and others else 0.0)
+        result.append(np.array(found))
     return result
 
 

@@ -65,15 +65,26 @@ def q_tot(critic: Any, spec: EnvSpec, s: np.ndarray, u: np.ndarray) -> float:
     return _q_tot(critic, spec, s, u, np.zeros(0), None)
 
 
-def q_tot_team(pevfa: Any, spec: EnvSpec, s: np.ndarray, u: np.ndarray, e: np.ndarray) -> float:
-    """``Q_theta(s, u, W)`` of a team whose policy embedding is ``e``."""
-    return _q_tot(pevfa.critic, spec, s, u, e, pevfa)
+def q_tot_team(
+    pevfa: Any, spec: EnvSpec, s: np.ndarray, u: np.ndarray, e: np.ndarray, own: Any = None
+) -> float:
+    """``Q_theta(s, u, W)`` of a team whose policy embedding is ``e``.
+
+    ``own`` are embeddings of its agents, which their utilities take instead.
+    """
+    return _q_tot(pevfa.critic, spec, s, u, e, pevfa, own)
 
 
 def _q_tot(
-    critic: Any, spec: EnvSpec, s: np.ndarray, u: np.ndarray, e: np.ndarray, pevfa: Any
+    critic: Any,
+    spec: EnvSpec,
+    s: np.ndarray,
+    u: np.ndarray,
+    e: np.ndarray,
+    pevfa: Any,
+    own: Any = None,
 ) -> float:
-    own = critic.utilities.first.weight.shape[-1]
+    width = critic.utilities.first.weight.shape[-1]
     shared = critic.mixer.first.weight.shape[-1]
     q = [
         utility(
@@ -82,8 +93,8 @@ def _q_tot(
             spec,
             s,
             u,
-            e,
-            np.zeros((0, own)) if pevfa is None else pevfa.utility_weight[i],
+            e if own is None else own[i],
+            np.zeros((0, width)) if pevfa is None else pevfa.utility_weight[i],
         )
         for i in range(spec.n_agents)
     ]

@@ -137,6 +137,7 @@ def test_every_setting_is_in_a_shape_or_a_hyper_or_known_to_be_the_hosts() -> No
         "random_steps",
         "random_steps_owed",
         "marl_episodes",
+        "population_actions",
         "evolution_from",
         "replayed",
         "surrogate_probability",

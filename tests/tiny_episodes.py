@@ -50,7 +50,9 @@ def random_batch() -> Episode:
     return Episode(*typed, np.array(LENGTHS, np.int32))
 
 
-def tiny_facmac(tiny_config: Callable[..., Config], layer_norm: bool = False) -> Config:
+def tiny_facmac(
+    tiny_config: Callable[..., Config], layer_norm: bool = False, **race: Any
+) -> Config:
     """RACE over FACMAC with tiny networks, all of unequal sizes."""
     facmac = FacmacConfig(
         mixer_size=3,
@@ -63,7 +65,7 @@ def tiny_facmac(tiny_config: Callable[..., Config], layer_norm: bool = False) ->
         td_lambda=0.7,
         target_update_every=TARGET_EVERY,
     )
-    tiny = tiny_config("race", "facmac", race={"population_size": 4, "elite_copy": False})
+    tiny = tiny_config("race", "facmac", race={"population_size": 4, "elite_copy": False, **race})
     return dataclasses.replace(tiny, discrete=True, facmac=facmac)
 
 
@@ -188,8 +190,8 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
     """
     draws = Draws([], [])
     laid: list[Laid] = []
-    module = sys.modules["race.learners.facmac"]
-    gumbel_noise, deal_out = module.gumbel_noise, module.deal_out
+    module, pairs = sys.modules["race.learners.facmac"], sys.modules["race.learners.signals"]
+    gumbel_noise, deal_out = module.gumbel_noise, pairs.deal_out
 
     def record(kept: list[np.ndarray], values: Any) -> Any:
         jax.debug.callback(lambda x: kept.append(np.asarray(x)), values)
@@ -221,9 +223,9 @@ def stepper(config: Config, algorithm: Any, fixed: bool) -> Callable[..., Step]:
         for kept in draws:
             kept.clear()
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(module, "GROUP", GROUP)
+            patch.setattr(pairs, "GROUP", GROUP)
             patch.setattr(module, "gumbel_noise", noise)
-            patch.setattr(module, "deal_out", deal)
+            patch.setattr(pairs, "deal_out", deal)
             after, critics, policies = update(
                 before, batch.slots, jnp.int32(number), jax.random.key(5)
             )

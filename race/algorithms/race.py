@@ -9,6 +9,7 @@ the parts are interleaved minibatch by minibatch here, and evolution comes first
 PeVFA learns the values of the teams that act next.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import jax
@@ -26,6 +27,7 @@ from race.algorithms.race_update import (
     Policies,
     Targets,
     draw_teams,
+    of_all_agents,
     train_critics,
     train_policies,
 )
@@ -33,7 +35,7 @@ from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners import learner_of
 from race.networks.optimization import copy, init_trainable, parameters
-from race.types import Spec, Team
+from race.types import DiscreteSpec, Spec, Team
 
 
 class RaceState(NamedTuple):
@@ -45,8 +47,8 @@ class RaceState(NamedTuple):
     population: Population  # of heads
 
     @property
-    def heads(self) -> Float[Array, "P N H1 A"]:
-        """The teams of the population."""
+    def heads(self) -> Float[Array, "P _ H1 A"]:
+        """The teams of the population: a head for each agent, or one for all agents of a team."""
         heads: Array = self.population.teams.heads
         return heads
 
@@ -65,7 +67,8 @@ def init(key: PRNGKeyArray, spec: Spec, shape: Shape, hyper: Hyper) -> RaceState
     value = learner.init_value(keys[4], spec, shape)
     mine = learner.init_mine(keys[5], spec, shape)
     # Vmapped, since a program of hundreds of teams one after the other takes minutes to compile.
-    heads = jax.vmap(lambda team_key: learner.init_heads(team_key, spec, shape))(
+    new_team = learner.init_head if shape.team_heads == "shared" else learner.init_heads
+    heads = jax.vmap(lambda team_key: new_team(team_key, spec, shape))(
         jax.random.split(keys[6], shape.population_size)
     )
     return RaceState(
@@ -82,12 +85,10 @@ def init(key: PRNGKeyArray, spec: Spec, shape: Shape, hyper: Hyper) -> RaceState
 
 def teams(state: RaceState, spec: Spec, shape: Shape) -> Teams:
     """The population and, last, the MARL team, all over the same encoders."""
-    heads = jnp.concatenate([state.heads, _marl_team(state)[None]])
+    own = jax.vmap(lambda team: of_all_agents(team, spec))(state.heads)
+    marl = of_all_agents(state.policies.head.params, spec)
+    heads = jnp.concatenate([own, marl[None]])
     return Teams(state.policies.encoder.params, heads)
-
-
-def _marl_team(state: RaceState) -> Float[Array, "N H1 A"]:
-    return jnp.broadcast_to(state.policies.head.params, state.heads.shape[1:])
 
 
 def update(
@@ -154,14 +155,30 @@ def expected(
     return jax.vmap(of_one)(state.heads, states)
 
 
+def evolve_heads(
+    population: Population,
+    fitness: Float[Array, "P"],
+    key: PRNGKeyArray,
+    spec: Spec,
+    shape: Shape,
+    hyper: Hyper,
+) -> Population:
+    """Line 9; a team whose agents share a head evolves as one of a single agent."""
+    if shape.team_heads == "shared":
+        assert isinstance(spec, DiscreteSpec)
+        spec = dataclasses.replace(spec, n_agents=1)
+    return evolve(population, fitness, key, spec, shape, hyper)
+
+
 def entrant(state: RaceState, shape: Shape) -> Team:
-    """Of line 11: the MARL team's heads."""
-    return Team(None, _marl_team(state))
+    """Of line 11: the MARL team's heads, as many as teams of the population have."""
+    return Team(None, jnp.broadcast_to(state.policies.head.params, state.heads.shape[1:]))
 
 
 def tested(state: RaceState, spec: Spec) -> tuple[Tested, ...]:
     """The MARL team and the champion, over the same encoders."""
-    heads = {"marl": _marl_team(state), "champion": state.population.champion.heads}
+    teams = {"marl": state.policies.head.params, "champion": state.population.champion.heads}
+    heads = {name: of_all_agents(head, spec) for name, head in teams.items()}
     return (Tested(state.policies.encoder.params, heads),)
 
 
@@ -169,7 +186,7 @@ race = Algorithm(
     init=init,
     teams=teams,
     tested=tested,
-    evolve=evolve,
+    evolve=evolve_heads,
     update=update,
     entrant=entrant,
     population=population_of,

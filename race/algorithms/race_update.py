@@ -59,7 +59,7 @@ class Policies(NamedTuple):
 
 
 def of_all_agents(head: Float[Array, "_ H1 A"], spec: Spec) -> Float[Array, "N H1 A"]:
-    """The MARL team with a head for every agent, also where its agents share one."""
+    """A team with a head for every agent, also where its agents share one."""
     return jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
 
 
@@ -82,7 +82,7 @@ def _marl_values(
 
 
 def draw_teams(
-    heads: Float[Array, "P N H1 A"],
+    heads: Float[Array, "P _ H1 A"],
     marl_head: Float[Array, "_ H1 A"],
     key: PRNGKeyArray,
     spec: Spec,
@@ -94,8 +94,8 @@ def draw_teams(
     def team(key: PRNGKeyArray) -> Float[Array, "N H1 A"]:
         place = jax.random.randint(key, (), 0, n)
         if not shape.marl_among_teams:
-            return heads[place]
-        drawn = heads[jnp.minimum(place, n - 2)]
+            return of_all_agents(heads[place], spec)
+        drawn = of_all_agents(heads[jnp.minimum(place, n - 2)], spec)
         return jnp.where(place == n - 1, of_all_agents(marl_head, spec), drawn)
 
     first = team(key)
@@ -177,6 +177,10 @@ def train_policies(
     critic = None if shape.one_pevfa else learner.first_critic(of_critics.critic)
     pevfa = learner.first_pevfa(of_critics.pevfa)
     weights = value_weights(value, mask, hyper.value_awareness)
+    episodes = None
+    if shape.vmm_reduction == "sum":
+        assert learner.episodes is not None
+        episodes = learner.episodes(now)
 
     def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
         z = learner.encode(policies.encoder, now, spec)
@@ -196,9 +200,11 @@ def train_policies(
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
         # held fixed. Both are the same numbers and are computed once.
         fixed_mine = jax.lax.stop_gradient(policies.mine)
-        signal = learner.mutual_information(fixed_mine, now, z, pairs_key)
-        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key)
-        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None))(weights, signal, mask)
+        signal = learner.mutual_information(fixed_mine, now, z, pairs_key, shape)
+        plain = learner.mutual_information(policies.mine, now, fixed_z, pairs_key, shape)
+        vmm = jax.vmap(value_aware_mi_loss, in_axes=(None, 0, None, None))(
+            weights, signal, mask, episodes
+        )
         bound = jax.vmap(mutual_information_bound, in_axes=(0, None))(plain, mask)
         vfm = value_function_maximization_loss(q_marl, q_team, mask)
         # Encoders and MINEs, of which there are equally many, share no parameter among themselves:

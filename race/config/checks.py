@@ -188,6 +188,13 @@ def check(config: Config) -> None:
             race.own_share,
             "from 0 to 1, or None for what the replay buffer holds",
         ),
+        (
+            not config.one_head or race.evolution != "ga" or race.crossover != "agent",
+            "race.crossover",
+            race.crossover,
+            "parameter or layer with --race.team-heads shared: a team's only head can be exchanged "
+            "for another's, which makes a copy, but not in part",
+        ),
         *_population_rules(race),
         (
             config.whole_teams or race.vfm_marl_weight + race.vfm_team_weight + race.vmm_weight > 0,

@@ -22,11 +22,13 @@ _PARALLEL = (
     "largest_observation",
 )
 _SURROGATE = ("surrogate_probability", "surrogate_steps")
+_OF_EPISODES = ("vmm_reduction", "mine_negatives")
 _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
-    *("pevfa_target", "policy_embedding", *_SURROGATE),
+    *("pevfa_target", "policy_embedding", "utility_embedding", *_SURROGATE),
+    *(*_OF_EPISODES, "team_heads"),
 )
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
@@ -113,7 +115,7 @@ _DEFAULTS: dict[str, Any] = {
 
 def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
     """The settings that nothing reads, and why."""
-    yield from _idle_of_population(asked)
+    yield from _idle_of_population(asked, task.discrete)
     yield from _idle_of_pevfa(asked, task.discrete)
     yield from _idle_of_learner(asked, task.discrete)
     if not task.reads_env:
@@ -135,7 +137,7 @@ def _idle(asked: Config, task: Facts) -> Iterator[tuple[str, str]]:
         yield from ((f"env.{name}", why) for name in _HOST)
 
 
-def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
+def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     race = asked.race
     if not asked.has_population:
         why = f"with --algo {asked.algo}, which has no population"
@@ -145,6 +147,9 @@ def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
         own = f"with --algo {asked.algo}" if asked.algo != "race" else "with --race.no-sharing"
         names = [*_SHARED_ENCODERS, *["sharing"] * (asked.algo != "race")]
         yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
+    elif race.team_heads == "shared" and discrete:
+        why = "with --race.team-heads shared, where a team is one policy"
+        yield from ((f"race.{name}", why) for name in ("agent_mutation_probability", "selection"))
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)
@@ -158,11 +163,18 @@ def _idle_of_pevfa(asked: Config, discrete: bool) -> Iterator[tuple[str, str]]:
     base = _base(asked, discrete)
     if base != "matd3":
         yield "race.policy_embedding", f"with {base}, whose PeVFA is one critic"
+    if base != "facmac":
+        yield "race.utility_embedding", f"with {base}, whose PeVFA has no utilities"
     if discrete:
         why = f"on {asked.task}, whose actions are discrete"
         yield from ((f"race.{name}", why) for name in _SURROGATE)
-    elif asked.race.surrogate_probability == 0:
+        return
+    if asked.race.surrogate_probability == 0:
         yield "race.surrogate_steps", "with --race.surrogate-probability 0"
+    why = f"on {asked.task}, whose actions are continuous"
+    yield from ((f"race.{name}", f"{why}: minibatches hold no episodes") for name in _OF_EPISODES)
+    yield "race.population_actions", f"{why}: its policies leave nothing to chance"
+    yield "race.team_heads", f"{why}: those of its agents are not the same"
 
 
 def _base(asked: Config, discrete: bool) -> str:

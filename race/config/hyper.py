@@ -104,6 +104,8 @@ def hyper_of(config: Config) -> Hyper:
         idle |= {name for of in NUMBERS_OF_EVOLUTIONS.values() for name in of if name not in used}
     if race.own_share is None:
         idle.add("own_share")
+    if config.one_head:
+        numbers["agent_mutation_probability"] = 1.0  # of a mutating team's only head
     numbers |= dict.fromkeys(idle, unused)
     if numbers["largest_weight"] is None:
         numbers["largest_weight"] = float("inf")

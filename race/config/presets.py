@@ -72,8 +72,9 @@ def filled(config: Config, discrete: bool | None = None) -> Config:
     race, whole = config.race, config.algo in ("merl", "ea")
     if whole:  # the genetic algorithm of Khadka and Tumer (2018)
         alpha = 0.1
+    one_head = dataclasses.replace(config, discrete=discrete).one_head
     operators: dict[str, Any] = {
-        "crossover": "layer" if whole else "agent",
+        "crossover": "layer" if whole else "parameter" if one_head else "agent",
         "mutation": "layer" if whole else "agent",
         "mutation_draw": "weight" if whole else "row",
     }

@@ -21,6 +21,11 @@ Selection = Literal["team", "agent"]
 TeamDraw = Literal["once", "each"]
 PevfaTarget = Literal["target", "online"]
 PolicyEmbedding = Literal["shared", "each"]
+UtilityEmbedding = Literal["team", "agent"]
+VmmReduction = Literal["mean", "sum"]
+MineNegatives = Literal["steps", "episodes"]
+PopulationActions = Literal["greedy", "sampled"]
+TeamHeads = Literal["agent", "shared"]
 EVOLUTIONS = ("ga", "cem", "es")
 Replayed = Literal["all", "better"]
 TeamName = Literal["marl", "champion", "selected"]
@@ -173,7 +178,8 @@ class RaceConfig:
     """Probability that an agent of a mutating team is picked (at least one is)."""
     crossover: Level | None = None
     """What two parents exchange: policies of agents, rows of whole teams with no regard to agents
-    (parameter), or rows of random layers. None: agent, with merl and ea layer."""
+    (parameter), or rows of random layers. None: agent, with merl and ea layer, where a team has one
+    head for all agents parameter."""
     mutation: Level | None = None
     """What a mutation draws its weights from: the policies of picked agents, whole teams with no
     regard to agents (parameter), or random layers. None: agent, with merl and ea layer."""
@@ -205,8 +211,23 @@ class RaceConfig:
     like the MARL team's, or online, its actions as they are."""
     policy_embedding: PolicyEmbedding = "shared"
     """Whether the two critics of a PeVFA share a policy embedding or have one each."""
+    utility_embedding: UtilityEmbedding = "team"
+    """What FACMAC's PeVFA tells the utility of an agent of a team's policies: the embedding of the
+    team, or that of the agent's own. Its mixer sees the team's (Appendix A.1)."""
+    vmm_reduction: VmmReduction = "mean"
+    """Whether Eq. (5) is the mean over the steps of a minibatch of episodes, or the mean over its
+    episodes of the sums over their steps: as much larger as episodes are long."""
+    mine_negatives: MineNegatives = "steps"
+    """What Eq. (3) contrasts an agent's embedding in an episode with: the same agent's at other
+    steps, of any episode, or those of all agents of other episodes at the same time of theirs."""
     one_pevfa: bool = False
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
+    team_heads: TeamHeads = "agent"
+    """Discrete actions: whether a team of the population has a head for each agent, or one through
+    which all of its agents act, as the MARL team does. A team is then one policy."""
+    population_actions: PopulationActions = "greedy"
+    """Discrete actions of the population in training: the policies' best, or sampled from the
+    policies, as the MARL team's are. In tests they are the best."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
     own_share: float | None = None
@@ -359,6 +380,12 @@ class Config:
     def whole_teams(self) -> bool:
         """Whether whole networks evolve instead of heads over shared encoders."""
         return self.has_population and not (self.algo == "race" and self.race.sharing)
+
+    @property
+    def one_head(self) -> bool:
+        """Whether all agents of a team of the population act through one head."""
+        evolves_heads = self.has_population and not self.whole_teams
+        return evolves_heads and self.discrete and self.race.team_heads == "shared"
 
     @property
     def n_marl_teams(self) -> int:

@@ -6,11 +6,15 @@ from race.config.settings import (
     Base,
     Config,
     Level,
+    MineNegatives,
     MutationDraw,
     PevfaTarget,
     PolicyEmbedding,
     Selection,
     TeamDraw,
+    TeamHeads,
+    UtilityEmbedding,
+    VmmReduction,
 )
 
 
@@ -54,6 +58,10 @@ class Shape:
     marl_among_teams: bool
     pevfa_target: PevfaTarget
     policy_embedding: PolicyEmbedding
+    utility_embedding: UtilityEmbedding
+    vmm_reduction: VmmReduction
+    mine_negatives: MineNegatives
+    team_heads: TeamHeads
     one_pevfa: bool
     shared_agents: bool
 
@@ -95,11 +103,15 @@ def shape_of(config: Config) -> Shape:
         evolution=race.evolution if evolves else "ga",
         crossover=race.crossover if genetic and race.crossover else "agent",
         mutation=race.mutation if genetic and race.mutation else "agent",
-        selection=race.selection if genetic else "team",
+        selection=race.selection if genetic and not config.one_head else "team",
         team_draw=race.team_draw if represents else "once",
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",
+        utility_embedding=race.utility_embedding if represents and mixes else "team",
+        vmm_reduction=race.vmm_reduction if represents and discrete else "mean",
+        mine_negatives=race.mine_negatives if represents and discrete else "steps",
+        team_heads="shared" if config.one_head else "agent",
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

@@ -73,7 +73,10 @@ class Learner(NamedTuple):
     state_values: Callable[..., Float[Array, "B"]]
     """(value, moments) -> V_zeta(s)."""
     mutual_information: Callable[..., Float[Array, "M B"]]
-    """(mine, moments, z, key) -> the signals I_t below Eq. (3) of each MINE."""
+    """(mine, moments, z, key, shape) -> the signals I_t below Eq. (3) of each MINE."""
+    episodes: Callable[[Any], Float[Array, ""]] | None
+    """moments -> how many episodes the steps of a minibatch are of; None where they are
+    transitions."""
     policy_due: Callable[..., bool | Bool[Array, ""]]
     """(step, shape) -> whether this gradient step also trains policies and moves targets."""
     scale_output: Callable[..., Any]

@@ -10,16 +10,18 @@ first: ``B = (L - 1) * R``. Joint actions are one-hot, ``[B, N, A]``.
 """
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.config.hyper import Hyper
 from race.config.shape import Shape
 from race.learners.base import Learner, Samples
-from race.method.equations import mutual_information_signal
+from race.learners.moments import Moments
+from race.learners.signals import mutual_information
 from race.method.exploration import greedy, gumbel_softmax
 from race.method.returns import lambda_returns
 from race.networks import critics, factored
@@ -34,22 +36,7 @@ from race.networks.recurrent import (
 )
 from race.types import DiscreteSpec, Slots
 
-GROUP = 32
-"""Steps among which MINE's pairs are made."""
-
 Head = Float[Array, "_ H1 A"]
-
-
-class Moments(NamedTuple):
-    """What the networks see of the slots of a minibatch."""
-
-    obs: Float[Array, "L R N O"]
-    last_action: Int[Array, "L R N"]  # -1 before the first step
-    avail_actions: Bool[Array, "L R N A"]
-    state: Float[Array, "L R S"]
-    first: Bool[Array, "L R"]  # an episode begins here
-    real: Float[Array, "L R"]  # 0 where no step was made, or in `later` where there is no moment
-    moment: Int[Array, "L R"]  # chance depends on it, so that the layout has no say
 
 
 def new_encoder(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> GruEncoder:
@@ -109,7 +96,8 @@ def new_pevfa(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> FactoredPe
     critic_key, pevfa_key = jax.random.split(key)
     size = shape.policy_embedding_size
     critic = new_critic(critic_key, spec, shape, size)
-    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size)
+    of_agents = shape.utility_embedding == "agent"
+    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size, of_agents)
 
 
 def new_value(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> StateValue:
@@ -208,9 +196,12 @@ def _values(
     samples, agents, actions = action.shape
     obs = moments.obs.reshape(samples * agents, -1)
     inputs = jnp.concatenate([obs, action.reshape(samples * agents, actions)], axis=1)
-    utilities = factored.utility_values(critic.utilities, inputs, shifts[0])
+    shift, of_mixer = shifts
+    if shift is not None and shift.ndim == 2:  # one for each agent
+        shift = jnp.broadcast_to(shift, (samples, *shift.shape)).reshape(samples * agents, -1)
+    utilities = factored.utility_values(critic.utilities, inputs, shift)
     state = moments.state.reshape(samples, -1)
-    return factored.mix(critic.mixer, state, utilities.reshape(samples, agents), shifts[1])[None]
+    return factored.mix(critic.mixer, state, utilities.reshape(samples, agents), of_mixer)[None]
 
 
 def q_marl(
@@ -229,7 +220,9 @@ def q_team(
 ) -> Float[Array, "1 B"]:
     """``Q_theta(s, u, W)``."""
     vectors = jnp.swapaxes(head, 1, 2).reshape(-1, head.shape[1])
-    return _values(pevfa.critic, moments, action, factored.embedding_shifts(pevfa, vectors))
+    agents = np.repeat(np.arange(head.shape[0]), head.shape[2])
+    shifts = factored.embedding_shifts(pevfa, vectors, agents)
+    return _values(pevfa.critic, moments, action, shifts)
 
 
 def only(values: Float[Array, "1 B"]) -> Float[Array, "B"]:
@@ -261,47 +254,9 @@ def state_values(value: StateValue, moments: Moments) -> Float[Array, "B"]:
     return critics.state_values(value, state, jax.nn.relu)
 
 
-def mutual_information(
-    mine: Mine, moments: Moments, z: Float[Array, "T R N H"], key: PRNGKeyArray
-) -> Float[Array, "1 B"]:
-    """Signals of every step, averaged over the agents that have something to choose.
-
-    The steps of a minibatch are thrown together and dealt out anew, `GROUP` at a time, in an order
-    that depends on which steps they are and not on where in the minibatch they lie; a step's
-    negatives are the same agent's embeddings at the other steps of its group. All pairs of a
-    minibatch would be a thousand times as many as its steps. An agent with one available action
-    (a dead one) has no part in it; the signal of a step at which all are such is 0.
-    """
-    agents = z.shape[2]
-    living = jnp.sum(moments.avail_actions, axis=-1) > 1
-    counted = living.astype(z.dtype) * moments.real[..., None]
-    samples = z.shape[0] * z.shape[1]
-    groups = -(-samples // GROUP)
-    order = deal_out(key, moments.moment.reshape(-1), moments.real.reshape(-1) > 0)
-    deal = jnp.concatenate([order, jnp.arange(samples, groups * GROUP)])
-
-    def dealt(x: Array) -> Array:
-        flat = x.reshape(samples, *x.shape[2:])
-        missing = jnp.zeros((groups * GROUP - samples, *flat.shape[1:]), flat.dtype)
-        return jnp.concatenate([flat, missing])[deal].reshape(groups, GROUP, *flat.shape[1:])
-
-    state, embedding, count = dealt(moments.state), dealt(z), dealt(counted)
-    x = jax.nn.leaky_relu(mine.state_hidden(state.reshape(groups * GROUP, -1)))
-    x = jax.nn.leaky_relu(mine.state_out(x)).reshape(groups, GROUP, -1)
-    y = mine.embedding(embedding.reshape(groups * GROUP * agents, -1))
-    y = y.reshape(groups, GROUP, agents, -1)
-    scores = jnp.einsum("gtm,gknm->gntk", x, y)
-    signal = jax.vmap(jax.vmap(mutual_information_signal, in_axes=(0, 1)))(scores, count)
-    total = jnp.sum(jnp.swapaxes(signal, 1, 2) * count, axis=2)
-    mean = total / jnp.maximum(jnp.sum(count, axis=2), 1.0)
-    return mean.reshape(-1)[jnp.argsort(deal)[:samples]][None]
-
-
-def deal_out(key: PRNGKeyArray, moment: Int[Array, "B"], real: Bool[Array, "B"]) -> Int[Array, "B"]:
-    """The samples of a minibatch in a random order of its steps; what is no step comes last."""
-    bits = jax.vmap(lambda one: jax.random.bits(jax.random.fold_in(key, one)))(moment)
-    # Two steps of the same number, one in a few million, are told apart by which they are.
-    return jnp.lexsort((moment, bits, ~real))
+def episodes(moments: Moments) -> Float[Array, ""]:
+    """How many there are; each has a step, and so its first moment, among them."""
+    return jnp.sum(moments.first.astype(jnp.float32))
 
 
 def policy_due(step: Int[Array, ""], shape: Shape) -> bool:
@@ -338,6 +293,7 @@ facmac = Learner(
     first_pevfa=same,
     state_values=state_values,
     mutual_information=mutual_information,
+    episodes=episodes,
     policy_due=policy_due,
     scale_output=factored.scale_output,
     follow=follow,

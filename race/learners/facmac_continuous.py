@@ -48,7 +48,8 @@ def new_pevfa(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> FactoredPevfa:
     critic_key, pevfa_key = jax.random.split(key)
     size = shape.policy_embedding_size
     critic = new_critic(critic_key, spec, shape, size)
-    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size)
+    of_agents = shape.utility_embedding == "agent"
+    return factored.init_pevfa(pevfa_key, critic, shape.embedding_size + 1, size, of_agents)
 
 
 def _values(
@@ -90,7 +91,8 @@ def q_team(
     spec: EnvSpec,
 ) -> Float[Array, "1 B"]:
     """``Q_theta(s, u, W)``."""
-    shifts = factored.embedding_shifts(pevfa, head_vectors(head, spec))
+    agents = spec.joint_gather // spec.action_size
+    shifts = factored.embedding_shifts(pevfa, head_vectors(head, spec), agents)
     return _values(pevfa.critic, state, action, spec, shifts)
 
 

@@ -157,7 +157,11 @@ def state_values(value: StateValue, state: Float[Array, "B S"]) -> Float[Array, 
 
 
 def mutual_information(
-    mine: Mine, state: Float[Array, "B S"], z: Float[Array, "N B H"], key: PRNGKeyArray
+    mine: Mine,
+    state: Float[Array, "B S"],
+    z: Float[Array, "N B H"],
+    key: PRNGKeyArray,
+    shape: Shape,
 ) -> Float[Array, "M B"]:
     """Signals of every encoder; the other samples of the batch are the negatives.
 
@@ -202,6 +206,7 @@ matd3 = Learner(
     first_pevfa=first_pevfa,
     state_values=state_values,
     mutual_information=mutual_information,
+    episodes=None,
     policy_due=policy_due,
     scale_output=critics.scale_output,
     follow=follow,

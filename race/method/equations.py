@@ -86,6 +86,28 @@ def mutual_information_signal(scores: Float[Array, "B B"], mask: Mask = None) ->
     return -jax.nn.softplus(-paired) - unpaired
 
 
+def mutual_information_signal_across(
+    scores: Float[Array, "E E N"], mask: Float[Array, "E N"]
+) -> Float[Array, "E"]:
+    """The signal ``I_t(z_t, s_t)`` below Eq. (3) at one time of E episodes of N agents.
+
+    It is the mean over the agents' pairs ``(s_t, z_t)`` of an episode. The embeddings of all agents
+    of the other episodes stand for the product of the marginals; not so those of the other agents
+    of the same episode, which come with this very state.
+
+    Args:
+        scores: ``T_omega(s, z)``, the state of the first axis, the embedding of the others.
+        mask: the embeddings that count. An episode without any has the signal 0; so has one beside
+            which there is no other, since nothing would keep its scores from growing.
+    """
+    own = jnp.diagonal(scores, axis1=0, axis2=1).T
+    apart = mask[None] * (1.0 - jnp.eye(scores.shape[0], dtype=mask.dtype))[:, :, None]
+    n_own, n_apart = jnp.sum(mask, axis=1), jnp.sum(apart, axis=(1, 2))
+    paired = -jnp.sum(mask * jax.nn.softplus(-own), axis=1) / jnp.maximum(n_own, 1.0)
+    unpaired = jnp.sum(apart * jax.nn.softplus(scores), axis=(1, 2)) / jnp.maximum(n_apart, 1.0)
+    return jnp.where((n_own > 0) & (n_apart > 0), paired - unpaired, 0.0)
+
+
 def mutual_information_bound(signal: Float[Array, "B"], mask: Mask = None) -> Scalar:
     """Eq. (3): the lower bound ``I_lb(z; s)``, the mean of the per-step signals."""
     return expectation(signal, mask)
@@ -130,10 +152,24 @@ def value_weights(
 
 
 def value_aware_mi_loss(
-    weights: Float[Array, "B"], signal: Float[Array, "B"], mask: Mask = None
+    weights: Float[Array, "B"],
+    signal: Float[Array, "B"],
+    mask: Mask = None,
+    episodes: Scalar | None = None,
 ) -> Scalar:
-    """Eq. (5): ``L_VMM = -E_D[w(s_t) I_t(z_t, s_t)]`` with the weights of `value_weights`."""
-    return -expectation(weights * signal, mask)
+    """Eq. (5): ``L_VMM = -E_D[w(s_t) I_t(z_t, s_t)]`` with the weights of `value_weights`.
+
+    Args:
+        weights: w.
+        signal: I_t.
+        mask: of the samples.
+        episodes: how many the samples are of. If given, the expectation is over episodes, of each
+            of which it takes the sum over its steps; else it is over steps.
+    """
+    if episodes is None:
+        return -expectation(weights * signal, mask)
+    real = jnp.ones_like(signal) if mask is None else mask
+    return -jnp.sum(jnp.where(real > 0, weights * signal, 0.0)) / episodes
 
 
 def encoder_loss(vfm: Scalar, vmm: Scalar, vmm_weight: Number) -> Scalar:

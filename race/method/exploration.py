@@ -46,10 +46,13 @@ def epsilon(step: int, start: float, finish: float, steps: int) -> float:
 def explore(
     logits: Float[Array, "*b A"],
     available: Bool[Array, "*b A"],
-    epsilon: Float[Array, ""],
+    epsilon: Float[Array, "..."],
     key: PRNGKeyArray,
 ) -> Int[Array, "*b"]:
-    """Samples of the policy, of which a share ``epsilon`` is uniform among available actions."""
+    """Samples of the policy, of which a share ``epsilon`` is uniform among available actions.
+
+    Shares that are not the same for all choices have axes that broadcast to the choices'.
+    """
     policy_key, uniform_key, choice_key = jax.random.split(key, 3)
 
     def sample(logits: Float[Array, "*b A"], key: PRNGKeyArray) -> Int[Array, "*b"]:

@@ -188,10 +188,15 @@ def embed_policy(embedding: PolicyEmbedding, vectors: Float[Array, "U H1"]) -> F
 
     As in Table 2, nothing follows the third layer.
     """
+    return jnp.mean(embed_vectors(embedding, vectors), axis=0)
+
+
+def embed_vectors(embedding: PolicyEmbedding, vectors: Float[Array, "U H1"]) -> Float[Array, "U E"]:
+    """The embedding of each action entry's vector."""
     first, second, out = embedding.layers
     x = jax.nn.leaky_relu(first(vectors))
     x = jax.nn.leaky_relu(second(x))
-    return jnp.mean(out(x), axis=0)
+    return out(x)
 
 
 class Mine(eqx.Module):

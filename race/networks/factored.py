@@ -9,20 +9,18 @@ leading axis ``N``, and what goes in as ``[N, B, ...]`` comes out as ``[N, B]``.
 all, agents and samples are laid out alike.
 """
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from race.config.hyper import Number
 from race.networks.dense import (
     Dense,
     PolicyEmbedding,
     before_activation,
-    embed_policy,
+    embed_vectors,
     init_dense,
     init_policy_embedding,
 )
@@ -61,15 +59,18 @@ class FactoredCritic(eqx.Module):
 class FactoredPevfa(eqx.Module):
     """Critic PeVFA and Mixer PeVFA: both take the policy embedding of a team as a further input.
 
-    The embedding is one vector for the whole batch, so in each first layer it is a shift of the
-    bias. In the mixer it stands beside the state, as an input of the hypernetworks: behind weights
-    that are not negative, where the utilities go in, it could only push one way.
+    With ``of_agents`` the utility of an agent takes the embedding of that agent's policy instead,
+    and the mixer that of the team. An embedding is one vector for the whole batch, so in each first
+    layer it is a shift of the bias. In the mixer it stands beside the state, as an input of the
+    hypernetworks: behind weights that are not negative, where the utilities go in, it could only
+    push one way.
     """
 
     critic: FactoredCritic
     embedding: PolicyEmbedding
     utility_weight: Float[Array, "*stack E h1"]
     mixer_weight: Float[Array, "E W"]
+    of_agents: bool = eqx.field(static=True, default=False)
 
 
 def init_utilities(
@@ -120,11 +121,11 @@ def utility_values(
         utilities: the networks.
         inputs: an observation, then an action, per row.
         shift: what inputs that are the same for the whole batch add to the first layer,
-            ``[*stack, h1]``.
+            ``[*stack, h1]``; or what others add to each row, ``[*stack, B, h1]``.
     """
     x = utilities.first(inputs)
     if shift is not None:
-        x = x + shift[..., None, :]
+        x = x + (shift if shift.ndim == x.ndim else shift[..., None, :])
     x = jax.nn.relu(before_activation(x, utilities.layer_norm))
     x = utilities.hidden(x)
     x = jax.nn.relu(before_activation(x, utilities.layer_norm))
@@ -162,7 +163,11 @@ def mix(
 
 
 def init_pevfa(
-    key: PRNGKeyArray, critic: FactoredCritic, head_rows: int, embedding_size: int
+    key: PRNGKeyArray,
+    critic: FactoredCritic,
+    head_rows: int,
+    embedding_size: int,
+    of_agents: bool = False,
 ) -> FactoredPevfa:
     """A fresh PeVFA around a fresh critic, whose ``further_inputs`` are ``embedding_size``.
 
@@ -171,6 +176,7 @@ def init_pevfa(
         critic: utilities and mixer.
         head_rows: entries ``H + 1`` of the vector that produces one entry of an action.
         embedding_size: units of the policy embedding.
+        of_agents: whether utilities see the embeddings of their agents' own policies.
     """
     k1, k2, k3 = jax.random.split(key, 3)
     first, mixer_first = critic.utilities.first.weight, critic.mixer.first.weight
@@ -185,6 +191,7 @@ def init_pevfa(
         init_policy_embedding(k1, head_rows, embedding_size),
         weight(k2, first),
         weight(k3, mixer_first),
+        of_agents,
     )
 
 
@@ -201,12 +208,27 @@ def scale_output(
     return scaled
 
 
-def embedding_shifts(pevfa: FactoredPevfa, vectors: Float[Array, "U H1"]) -> tuple[Any, Any]:
-    """What a team's policy embedding adds to the first layers of utilities and of hypernetworks.
+def embedding_shifts(
+    pevfa: FactoredPevfa, vectors: Float[Array, "U H1"], agents: Int[np.ndarray, "U"]
+) -> tuple[Array, Array]:
+    """What a team's policies add to the first layers of utilities and of hypernetworks.
 
     Args:
         pevfa: the PeVFA.
         vectors: the team's heads, one row per entry of the agents' actions.
+        agents: whose each row is; every agent has one at least.
+
+    Returns:
+        The shift of the utilities, ``[N, h1]`` where networks or embeddings are the agents' own,
+        else ``[h1]``; and that of the hypernetworks, ``[W]``.
     """
-    e = embed_policy(pevfa.embedding, vectors)
-    return jnp.matmul(e, pevfa.utility_weight), jnp.matmul(e, pevfa.mixer_weight)
+    each = embed_vectors(pevfa.embedding, vectors)
+    team = jnp.mean(each, axis=0)
+    if pevfa.of_agents:
+        own = (agents[None] == np.unique(agents)[:, None]).astype(np.float32)
+        of_each = jnp.asarray(own / own.sum(axis=1, keepdims=True), each.dtype) @ each  # [N, E]
+        product = "ne,neh->nh" if pevfa.utility_weight.ndim == 3 else "ne,eh->nh"
+        to_utilities = jnp.einsum(product, of_each, pevfa.utility_weight)
+    else:
+        to_utilities = jnp.matmul(team, pevfa.utility_weight)
+    return to_utilities, jnp.matmul(team, pevfa.mixer_weight)

@@ -48,8 +48,10 @@ class Score(NamedTuple):
 class Play(NamedTuple):
     """The teams of one run that play a generation: the population, then the MARL team.
 
-    The MARL team alone explores; it plays as often as ``n_marl`` says. ``generation`` counts from
-    0, ``env_steps`` were made before; all steps go into the buffer, if it has room at all.
+    The MARL team explores, the population only where its actions are sampled
+    (`RaceConfig.population_actions`). The MARL team plays as often as ``n_marl`` says.
+    ``generation`` counts from 0, ``env_steps`` were made before; all steps go into the buffer, if
+    it has room at all.
     """
 
     config: Config

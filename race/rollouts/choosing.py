@@ -15,10 +15,10 @@ from race.types import Observation
 
 
 class Exploration(NamedTuple):
-    """Who explores, and how much."""
+    """Who samples actions from its policies, and how many at random from what is available."""
 
     exploring: Bool[Array, "T"]
-    epsilon: Float[Array, ""]
+    epsilon: Float[Array, "T"]
     key: PRNGKeyArray
 
 
@@ -57,6 +57,6 @@ def choose(
     action = greedy(scores, seen.avail_actions)
     if how is not None:
         key = jax.random.fold_in(how.key, tick)
-        explored = explore(scores, seen.avail_actions, how.epsilon, key)
+        explored = explore(scores, seen.avail_actions, how.epsilon[:, None], key)
         action = jnp.where(how.exploring[:, None], explored, action)
     return Memory(z, action), action

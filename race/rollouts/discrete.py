@@ -96,7 +96,7 @@ class EpisodeRollouts(Closing):
         return WarmUp(replay, 0)
 
     def play(self, plays: Sequence[Play]) -> list[tuple[Replay, Generation] | DivergenceError]:
-        """MARL teams choose at random now and then; populations explore by their diversity."""
+        """MARL teams choose at random now and then; populations by their policies, if at all."""
         parts = [Part(play.teams, _seeds(play), _exploration(play)) for play in plays]
         before, found = self.repeated, list(self._episodes(parts))
         results: list[tuple[Replay, Generation] | DivergenceError] = []
@@ -226,14 +226,16 @@ def _with_episodes(
 
 
 def _exploration(play: Play) -> Exploration | None:
-    if not play.n_marl:
+    sampled = play.config.race.population_actions == "sampled"
+    if not (play.n_marl or sampled):
         return None
     facmac, teams = play.config.facmac, play.teams.count
     share = epsilon(
         play.env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
     )
+    marl = jnp.arange(teams) >= teams - play.n_marl
     return Exploration(
-        jnp.arange(teams) >= teams - play.n_marl,
-        jnp.float32(share),
+        jnp.ones(teams, bool) if sampled else marl,
+        jnp.where(marl, jnp.float32(share), jnp.float32(0)),
         jax.random.fold_in(root_key(play.config.seed, Purpose.ROLLOUT), play.generation),
     )

@@ -28,6 +28,7 @@ def kind_of(config: Config) -> tuple[Any, ...]:
         config.algo,
         shape_of(config),
         config.n_marl_teams,
+        config.race.population_actions,
         config.evaluation.episodes,
         config.facmac.replay_precision,
         config.compute,

@@ -61,22 +61,31 @@ def made_to_fit(
     if origin.env.normalise != config.env.normalise:
         raise _misfit(source, "one of the two normalises observations (--env.normalise)")
     encoder, head, team = encoders[marl], np.asarray(heads[marl]), None
-    if config.has_marl and template.head is not None and len(template.head) < len(head):
-        if not (head == head[:1]).all():
-            raise _misfit(source, "its agents have heads of their own, and here all share one")
-        head = head[:1]
+    if config.has_marl and template.head is not None:
+        head = _as_many(head, template.head, source)
     if config.whole_teams:
         own = encoders[champion]
         if not (apart and champion == "champion"):
             own = learner.of_each_agent(own)
         team = Team(own, np.asarray(heads[champion]))
     elif config.has_population:
-        team = Team(None, np.asarray(heads[marl if apart else champion]))
+        own = np.asarray(heads[marl if apart else champion])
+        assert template.team is not None
+        team = Team(None, _as_many(own, template.team.heads, source))
     fitted = Inherited(encoder, head, team)
     if not config.has_marl:
         fitted = fitted._replace(encoder=None, head=None)
     _refuse_misfit(fitted, template, source)
     return fitted
+
+
+def _as_many(head: Any, wanted: Any, source: Path) -> Any:
+    """One head for all agents, if that is wanted of a team whose agents have equal ones."""
+    if len(wanted) >= len(head):
+        return head
+    if not (head == head[:1]).all():
+        raise _misfit(source, "its agents have heads of their own, and here all share one")
+    return head[:1]
 
 
 def observed_to_fit(observed: Observed | None, source: Path, spec: Spec) -> Observed | None:

@@ -20,11 +20,13 @@ from float64_episodes import (
     critic_loss,
     episodes_of,
     float64,
+    mean,
     min_max,
     pevfa_loss,
     policy_values,
     sampled,
     signals,
+    signals_across,
     targets_of,
     v_zeta,
     value_loss,
@@ -53,10 +55,16 @@ from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
 from race.config.settings import Config
 
+CHOSEN = {"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"}
 
-@pytest.fixture(scope="module", params=[True, False], ids=["normalised", "plain"])
+
+@pytest.fixture(
+    scope="module",
+    params=[{"layer_norm": True}, {}, CHOSEN],
+    ids=["normalised", "plain", "other choices"],
+)
 def config(request: Any, tiny_config: Callable[..., Config]) -> Config:
-    return tiny_facmac(tiny_config, layer_norm=request.param)
+    return tiny_facmac(tiny_config, **request.param)
 
 
 class Explained(NamedTuple):
@@ -71,7 +79,13 @@ class Explained(NamedTuple):
     y_team: list[np.ndarray]
     marl_samples: Sampled
     team_samples: Sampled
-    groups: list[list[tuple[int, int]]]
+    groups: list[list[tuple[int, int]]]  # none where MINE's negatives are of other episodes
+    summed: bool  # over steps, in Eq. (5)
+
+    def signals(self, mine: Any, encoder: Any) -> list[np.ndarray]:
+        if not self.groups:
+            return signals_across(mine, encoder, self.episodes)
+        return signals(mine, encoder, self.episodes, self.groups)
 
 
 def of_steps(batch: Laid, noise: np.ndarray) -> list[np.ndarray]:
@@ -109,12 +123,18 @@ def explained(config: Config, batch: Laid) -> Explained:
             orders.append((marl_s, team_s))
     ((marl_s, team_s),) = orders
     # MINE and the encoder learn from the same pairs.
-    deal, again = got.draws.deals
-    assert np.array_equal(deal, again)
-    groups = groups_of(batch, deal)
-    assert sorted(step for group in groups for step in group) == sorted(batch.where)
+    groups = []
+    if config.race.mine_negatives == "steps":
+        deal, again = got.draws.deals
+        assert np.array_equal(deal, again)
+        groups = groups_of(batch, deal)
+        assert sorted(step for group in groups for step in group) == sorted(batch.where)
+    else:
+        assert not got.draws.deals
+    summed = config.race.vmm_reduction == "sum"
+    targets, samples = (y_marl, y_team), (marl_s, team_s)
     return Explained(
-        got.before, got.after, got.losses, episodes, team, y_marl, y_team, marl_s, team_s, groups
+        got.before, got.after, got.losses, episodes, team, *targets, *samples, groups, summed
     )
 
 
@@ -176,8 +196,8 @@ def vmm(x: Explained, encoder: Any, mine: Any) -> float:
     """Eq. (5), with the values before the step of Eq. (4)."""
     value = params(x.before.critics).value
     weights = min_max([v_zeta(value, one.state[:-1]) for one in x.episodes])
-    signal = signals(mine, encoder, x.episodes, x.groups)
-    return -float(np.mean(np.concatenate(weights) * np.concatenate(signal)))
+    weighted = [w * signal for w, signal in zip(weights, x.signals(mine, encoder), strict=True)]
+    return -float(np.mean([one.sum() for one in weighted])) if x.summed else -mean(weighted)
 
 
 def test_the_encoder_descends_equation_6(explained: Explained, config: Config) -> None:
@@ -207,7 +227,7 @@ def test_mine_climbs_the_plain_bound_of_equation_3(explained: Explained) -> None
     encoder, _, mine = params(x.before.policies)
 
     def loss(mine: Any) -> float:
-        return -float(np.mean(np.concatenate(signals(mine, encoder, x.episodes, x.groups))))
+        return -mean(x.signals(mine, encoder))
 
     assert_loss(x, "mine", loss(mine))
     assert_gradients_equal(gradient_of(x.after.policies.mine), numeric_gradient(loss, mine))

@@ -37,10 +37,10 @@ PLAIN = ("critic", "pevfa", "value", "policy", "vfm")
 """Losses that are means of what each step of a minibatch gives for itself."""
 
 
-@pytest.fixture(scope="module")
-def config(tiny_config: Callable[..., Config]) -> Config:
+@pytest.fixture(scope="module", params=["steps", "episodes"])
+def config(request: Any, tiny_config: Callable[..., Config]) -> Config:
     """Critics are not moved, so that policies see the same ones whatever critics learned."""
-    config = tiny_facmac(tiny_config)
+    config = tiny_facmac(tiny_config, mine_negatives=request.param)
     facmac = dataclasses.replace(config.facmac, critic_learning_rate=0.0)
     return dataclasses.replace(config, facmac=facmac)
 

@@ -256,7 +256,7 @@ def test_one_encoder_has_one_mine_which_hears_all_agents(
     mine = state.policies.mine.params
     batch = batch_of(tiny_spec, B)
     z = dense.encode(state.policies.encoder.params, tiny_spec, batch.state)
-    found = matd3.mutual_information(mine, batch.state, z, jax.random.key(0))
+    found = matd3.mutual_information(mine, batch.state, z, jax.random.key(0), shape_of(shared))
     net, states = float64(mine), float64(batch.state)
     expected = []
     for agent in np.asarray(z, np.float64):

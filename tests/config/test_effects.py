@@ -19,6 +19,7 @@ METHODS: list[tuple[dict[str, Any], bool]] = [
     ({"algo": "merl", "base": "facmac"}, False),
     *(({"race": RaceConfig(evolution=name)}, True) for name in ("cem", "es", "own:operator")),
     *(({"race": RaceConfig(sharing=False)}, discrete) for discrete in (False, True)),
+    ({"race": RaceConfig(team_heads="shared")}, True),
 ]
 ON_HOST = {
     False: {
@@ -37,6 +38,8 @@ OTHER: dict[str, Any] = {
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
     **{"own_share": 0.5, "replayed": "better"},
+    **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
+    **{"population_actions": "sampled", "team_heads": "shared"},
 }
 SETTINGS = [
     (group, field.name)
@@ -67,6 +70,8 @@ def refused(config: Config, **facts: bool) -> str:
 def read_on_host(config: Config, group: str, name: str) -> bool:
     """Settings that neither `Shape` nor `Hyper` shows."""
     if group == "race":
+        if name == "population_actions":
+            return config.has_population and config.discrete
         beside = config.has_population and config.has_marl
         return beside and (
             name in ("marl_episodes", "evolution_from", "replayed")
@@ -90,6 +95,10 @@ def test_a_setting_is_refused_exactly_if_nothing_reads_it(
         value = other(name, getattr(settings, name))
         if name == "mutation_draw":  # methods differ in what they do where nothing is said
             value = "row" if resolved.race.mutation_draw == "weight" else "weight"
+        if (resolved.one_head, name) == (True, "crossover"):  # parameter is what it is
+            value = "layer"
+        if value == "shared" == getattr(settings, name):
+            value = "agent"
         assert value != getattr(settings, name)
         changed = dataclasses.replace(
             plain, **{group: dataclasses.replace(settings, **{name: value})}

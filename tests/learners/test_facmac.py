@@ -17,10 +17,10 @@ from float64_episodes import (
     episodes_of,
     float64,
     lambda_targets,
-    policy_embedding,
     q_tot,
     scores_of,
     signals,
+    signals_across,
     v_zeta,
 )
 from tiny_episodes import (
@@ -280,12 +280,11 @@ def test_values_of_both_critics(batch: Episode, laid: Laid, now: Any, nets: Netw
     q_team = facmac.q_team(nets.pevfa, moments, action, nets.heads, SPEC)
     assert q_marl.shape == q_team.shape == (1, B)
     pevfa = float64(nets.pevfa)
-    e_team = policy_embedding(pevfa, float64(nets.heads))
     for e, one in enumerate(episodes_of(batch)):
         seen = (one.obs[:-1], one.state[:-1], one.taken)
         for got, expected in (
             (q_marl, q_tot(float64(nets.critic), *seen)),
-            (q_team, q_tot(pevfa.critic, *seen, pevfa, e_team)),
+            (q_team, q_tot(pevfa.critic, *seen, pevfa, float64(nets.heads))),
         ):
             np.testing.assert_allclose(laid.steps(got[0])[e], expected, rtol=1e-4, atol=1e-4)
 
@@ -312,6 +311,27 @@ def test_the_pevfa_hears_of_every_agents_head_on_both_ways(
     assert jnp.array_equal(values[0], values[1])
 
 
+def test_utilities_may_hear_of_their_own_agents_head_alone(
+    batch: Episode, laid: Laid, now: Any, nets: Networks
+) -> None:
+    pevfa = dataclasses.replace(nets.pevfa, of_agents=True)
+    value = jax.jit(partial(facmac.q_team, pevfa, now.moments, now.action, spec=SPEC))
+    got = laid.steps(value(nets.heads)[0])
+    for e, one in enumerate(episodes_of(batch)):
+        seen = (one.obs[:-1], one.state[:-1], one.taken)
+        critic = float64(pevfa.critic)
+        expected = q_tot(critic, *seen, float64(pevfa), float64(nets.heads))
+        np.testing.assert_allclose(got[e], expected, rtol=1e-4, atol=1e-4)
+    # Where the mixer hears of no head, swapped heads are heard of, and the order matters.
+    deaf = dataclasses.replace(pevfa, mixer_weight=jnp.zeros_like(pevfa.mixer_weight))
+    for asked, hears in ((deaf, True), (dataclasses.replace(deaf, of_agents=False), False)):
+        both = [
+            facmac.q_team(asked, now.moments, now.action, heads, SPEC)
+            for heads in (nets.heads, nets.heads[::-1])
+        ]
+        assert (np.abs(both[0] - both[1]).max() > 1e-3) == hears
+
+
 @pytest.mark.parametrize("of_team", [False, True])
 @pytest.mark.parametrize("agent", range(N))
 def test_q_total_never_falls_with_a_utility(nets: Networks, of_team: bool, agent: int) -> None:
@@ -320,7 +340,9 @@ def test_q_total_never_falls_with_a_utility(nets: Networks, of_team: bool, agent
     utilities = 5.0 * jax.random.normal(keys[1], (200, N))
     rise = jax.random.uniform(keys[2], (200,), minval=0.01, maxval=3.0)
     vectors = jnp.swapaxes(nets.heads, 1, 2).reshape(-1, H + 1)
-    shift = embedding_shifts(nets.pevfa, vectors)[1] if of_team else None
+    shift = (
+        embedding_shifts(nets.pevfa, vectors, np.repeat(np.arange(N), A))[1] if of_team else None
+    )
     mixer = nets.pevfa.critic.mixer
     before = mix(mixer, state, utilities, shift)
     after = mix(mixer, state, utilities.at[:, agent].add(rise), shift)
@@ -350,15 +372,16 @@ def test_signals_of_the_steps_as_dealt(
     laid: Laid,
     now: Any,
     nets: Networks,
+    config: Config,
     seed: int | None,
 ) -> None:
     # 18 samples in groups of 4: two places of the last group are no samples at all.
     deal = np.arange(B) if seed is None else np.random.default_rng(seed).permutation(B)
-    module = sys.modules["race.learners.facmac"]
+    module = sys.modules["race.learners.signals"]
     monkeypatch.setattr(module, "GROUP", GROUP)
     monkeypatch.setattr(module, "deal_out", lambda key, moment, real: jnp.asarray(deal))
     z = facmac.encode(nets.encoder, now.moments, SPEC)
-    got = facmac.mutual_information(nets.mine, now.moments, z, KEY)
+    got = facmac.mutual_information(nets.mine, now.moments, z, KEY, shape_of(config))
     assert got.shape == (1, B)
     groups = groups_of(laid, deal)
     expected = signals(float64(nets.mine), float64(nets.encoder), episodes_of(batch), groups)
@@ -369,9 +392,36 @@ def test_signals_of_the_steps_as_dealt(
     assert (np.asarray(got[0])[np.asarray(now.mask) == 0] == 0).all()
 
 
+@pytest.mark.parametrize("most", [E, E + 3])
+def test_signals_against_other_episodes_at_the_same_time(
+    batch: Episode, laid: Laid, now: Any, nets: Networks, config: Config, most: int
+) -> None:
+    shape = dataclasses.replace(shape_of(config), mine_negatives="episodes", batch_size=most)
+    z = facmac.encode(nets.encoder, now.moments, SPEC)
+    got = facmac.mutual_information(nets.mine, now.moments, z, KEY, shape)
+    assert got.shape == (1, B)
+    expected = signals_across(float64(nets.mine), float64(nets.encoder), episodes_of(batch))
+    for signal, of_episode in zip(laid.steps(got[0]), expected, strict=True):
+        np.testing.assert_allclose(signal, of_episode, rtol=1e-4, atol=1e-5)
+    assert (np.asarray(got[0])[np.asarray(now.mask) == 0] == 0).all()
+    # Nobody is left at the last step of the longest episode to compare it with.
+    assert [int((signal == 0).sum()) for signal in expected] == [1, 0, 1, 0]
+
+
+def test_places_of_each_time(laid: Laid, now: Any) -> None:
+    places = sys.modules["race.learners.signals"].of_each_time(
+        now.moments.first, now.moments.real > 0, E
+    )
+    assert places.shape == (SIZE - 1, E)
+    assert int(facmac.episodes(now.moments)) == E
+    order = sorted(range(E), key=lambda e: laid.where[e, 0][::-1])  # row by row
+    for t, row in enumerate(np.asarray(places)):
+        assert row.tolist() == [laid.sample_of.get((e, t), B) for e in order]
+
+
 def test_chance_depends_on_the_moments_and_not_on_where_they_lie() -> None:
     """Noise and order of the same moments in two minibatches of unequal layouts."""
-    module = sys.modules["race.learners.facmac"]
+    module, pairs = (sys.modules[f"race.learners.{name}"] for name in ("facmac", "signals"))
     one = jnp.array([[3, 0], [7, 0], [9, 4]])
     two = jnp.array([[4, 9, 7, 3]])
     noise = [module.gumbel_noise(KEY, moment, (2, 3)) for moment in (one, two)]
@@ -380,7 +430,7 @@ def test_chance_depends_on_the_moments_and_not_on_where_they_lie() -> None:
         assert jnp.array_equal(noise[0][place], noise[1][other])
     real = [jnp.array([[True, False], [True, False], [True, True]]), jnp.ones((1, 4), bool)]
     orders = [
-        moment.reshape(-1)[module.deal_out(KEY, moment.reshape(-1), there.reshape(-1))]
+        moment.reshape(-1)[pairs.deal_out(KEY, moment.reshape(-1), there.reshape(-1))]
         for moment, there in zip((one, two), real, strict=True)
     ]
     assert orders[0][:4].tolist() == orders[1].tolist()
@@ -388,14 +438,14 @@ def test_chance_depends_on_the_moments_and_not_on_where_they_lie() -> None:
 
 
 def test_moments_are_dealt_with_independently() -> None:
-    module = sys.modules["race.learners.facmac"]
+    module, pairs = (sys.modules[f"race.learners.{name}"] for name in ("facmac", "signals"))
     moment = jnp.arange(400).reshape(50, 8)
     actions = module.gumbel_noise(KEY, moment, (5, A)).argmax(axis=-1)
     for axis in range(3):
         same = np.asarray(actions == jnp.roll(actions, 1, axis=axis)).mean()
         assert abs(same - 1 / A) < 5 * np.sqrt(1 / A * (1 - 1 / A) / actions.size)
     first = [
-        int(module.deal_out(key, jnp.arange(6), jnp.arange(6) < 4)[0])
+        int(pairs.deal_out(key, jnp.arange(6), jnp.arange(6) < 4)[0])
         for key in jax.random.split(KEY, 400)
     ]
     counts = np.bincount(first, minlength=6)
@@ -404,10 +454,12 @@ def test_moments_are_dealt_with_independently() -> None:
 
 
 def test_the_deal_is_drawn_anew_with_every_key(
-    monkeypatch: pytest.MonkeyPatch, now: Any, nets: Networks
+    monkeypatch: pytest.MonkeyPatch, now: Any, nets: Networks, config: Config
 ) -> None:
-    monkeypatch.setattr(sys.modules["race.learners.facmac"], "GROUP", GROUP)
+    monkeypatch.setattr(sys.modules["race.learners.signals"], "GROUP", GROUP)
     z = facmac.encode(nets.encoder, now.moments, SPEC)
     keys = jax.random.split(KEY, 2)
-    one, two = (facmac.mutual_information(nets.mine, now.moments, z, key) for key in keys)
+    one, two = (
+        facmac.mutual_information(nets.mine, now.moments, z, key, shape_of(config)) for key in keys
+    )
     assert not np.allclose(one, two)

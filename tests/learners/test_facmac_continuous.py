@@ -83,6 +83,23 @@ def test_the_pevfa_has_the_policy_embedding_as_further_inputs(
     assert not np.allclose(blind, expected, rtol=1e-3)
 
 
+def test_utilities_may_take_the_embedding_of_their_agents_own_head(
+    tiny_spec: EnvSpec, pevfa: Any, head: Any, inputs: tuple[jax.Array, jax.Array]
+) -> None:
+    """Agent 0 has one action, agent 1 two; padding has no part in either embedding."""
+    own = dataclasses.replace(pevfa, of_agents=True)
+    spoiled = head.at[0, :, 1].set(9.0)
+    q = facmac.q_team(own, *inputs, spoiled, tiny_spec)
+    columns = ([head[0, :, 0]], [head[1, :, 0], head[1, :, 1]])
+    each = [float64(embed_policy(pevfa.embedding, jnp.stack(of))) for of in columns]
+    e = float64(embed_policy(pevfa.embedding, head_vectors(head, tiny_spec)))
+    both = list(zip(*map(float64, inputs), strict=True))
+    expected = [q_tot_team(float64(pevfa), tiny_spec, s, u, e, each) for s, u in both]
+    np.testing.assert_allclose(q[0], expected, rtol=1e-4, atol=1e-5)
+    of_team = facmac.q_team(pevfa, *inputs, head, tiny_spec)
+    assert not np.allclose(of_team[0], expected, rtol=1e-3)
+
+
 @pytest.mark.parametrize("part", ["utility_weight", "mixer_weight"])
 def test_the_embedding_goes_into_utilities_and_into_hypernetworks(
     tiny_spec: EnvSpec, pevfa: Any, head: Any, inputs: tuple[jax.Array, jax.Array], part: str
@@ -117,7 +134,8 @@ def test_q_tot_rises_with_every_utility(
     state = 3.0 * jax.random.normal(state_key, (n, 4))
     utilities = 5.0 * jax.random.normal(value_key, (n, 2))
     rise = jax.random.uniform(rise_key, (n,), minval=0.01, maxval=3.0)
-    shift = embedding_shifts(pevfa, head_vectors(head, tiny_spec))[1] if of_team else None
+    vectors, owner = head_vectors(head, tiny_spec), np.array([1, 0, 1])
+    shift = embedding_shifts(pevfa, vectors, owner)[1] if of_team else None
     before = mix(pevfa.critic.mixer, state, utilities, shift)
     after = mix(pevfa.critic.mixer, state, utilities.at[:, agent].add(rise), shift)
     assert (after >= before).all()

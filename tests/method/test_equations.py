@@ -73,6 +73,26 @@ CASES: dict[str, tuple[Callable[..., Any], list[Any], Any]] = {
     "weights of equal values": (eq.value_weights, [[7.0, 7.0, 7.0]], [0.0, 0.0, 0.0]),
     "weights of large values": (eq.value_weights, [[1e30, -1e30, 0.0]], [1.0, 0.0, 0.5]),
     "vmm": (eq.value_aware_mi_loss, [[1.0, 0.0, 0.5], [-2.0, -100.0, -4.0]], 4 / 3),
+    "vmm summed over each of two episodes": (
+        partial(eq.value_aware_mi_loss, episodes=jnp.float32(2.0)),
+        [[1.0, 0.0, 0.5], [-2.0, -100.0, -4.0]],
+        2.0,
+    ),
+    # Two episodes of two agents; the second of episode 1 is dead. Of the first state, the own pairs
+    # are 1 and 1/3, the negative is 3; of the second the own pair is 1, negatives are 7 and 1.
+    "signal across two episodes": (
+        eq.mutual_information_signal_across,
+        [
+            np.log([[[1.0, 1 / 3], [3.0, 31.0]], [[7.0, 1.0], [1.0, 63.0]]]).tolist(),
+            [[1.0, 1.0], [1.0, 0.0]],
+        ],
+        [-1.5 * LN2 - 2 * LN2, -LN2 - 2 * LN2],
+    ),
+    "signal across episodes of which one is left": (
+        eq.mutual_information_signal_across,
+        [[[[5.0, -3.0], [9.0, 9.0]], [[9.0, 9.0], [9.0, 9.0]]], [[1.0, 1.0], [0.0, 0.0]]],
+        [0.0, 0.0],
+    ),
     "encoder_loss": (partial(eq.encoder_loss, vmm_weight=0.1), [2.0, 3.0], 2.3),
     "marl_policy_loss": (eq.marl_policy_loss, [[1.0, 3.0]], -2.0),
 }

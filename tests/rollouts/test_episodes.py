@@ -10,12 +10,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from frequencies import assert_frequency
 
 from race.algorithms.base import Teams
 from race.config.presets import resolve
 from race.config.settings import Config, FacmacConfig, RaceConfig
 from race.config.shape import shape_of
 from race.envs import make_discrete_task
+from race.envs.discrete_probe.rules import CLIMB_PAYOFFS
 from race.errors import DivergenceError, TaskError
 from race.learners.facmac import logits, new_encoder
 from race.method.exploration import greedy
@@ -64,7 +66,8 @@ def teams_of(spec: DiscreteSpec, count: int, seed: int = 0) -> Teams:
 
 
 def exploring(share: float, *teams: bool, seed: int = 0) -> Exploration:
-    return Exploration(jnp.array(teams), jnp.float32(share), jax.random.key(seed))
+    shares = jnp.full(len(teams), share, jnp.float32)
+    return Exploration(jnp.array(teams), shares, jax.random.key(seed))
 
 
 def play(
@@ -93,10 +96,11 @@ def generation_of(
     generation: int = 0,
     env_steps: int = 0,
     replay: Replay | None = None,
+    n_marl: int = 1,
 ) -> tuple[Replay, Generation]:
     """What one run's generation brings; its divergence is raised."""
     replay = rollouts.empty_replay(config) if replay is None else replay
-    (result,) = rollouts.play([Play(config, teams, 1, generation, env_steps, replay)])
+    (result,) = rollouts.play([Play(config, teams, n_marl, generation, env_steps, replay)])
     if isinstance(result, DivergenceError):
         raise result
     return result
@@ -415,13 +419,67 @@ def test_the_marl_team_alone_explores_in_training_less_and_less(on_device: bool)
     assert shown[100] == shown[1000] == 0
 
 
+def sampling(config: Config) -> Config:
+    """The population samples its actions."""
+    race = dataclasses.replace(config.race, population_actions="sampled")
+    return dataclasses.replace(config, race=race)
+
+
+@pytest.mark.parametrize(("on_device", "count"), [(True, 500), (False, 60)])
+def test_the_population_may_sample_its_policies_in_training_alone(
+    on_device: bool, count: int
+) -> None:
+    """The MARL team, last, is uniform throughout."""
+    task, chances = task_of("probe/climb"), [0.6, 0.3, 0.1]
+    shares = {"epsilon_start": 1.0, "epsilon_finish": 1.0}
+    greedily = config_of("probe/climb", count, **shares)
+    config, teams = sampling(greedily), bandit(chances, count + 1)
+    with EpisodeRollouts(config, task, on_device) as rollouts:
+
+        def chosen(config: Config, generation: int, n_marl: int = 1) -> Any:
+            found = generation_of(rollouts, config, teams, generation, n_marl=n_marl)
+            return np.asarray(found[0].data.action[: count + 1, 0]).astype(int)
+
+        actions, again, later = (chosen(config, g) for g in (0, 0, 1))
+        usual, alone = chosen(greedily, 0), chosen(config, 0, n_marl=0)
+        heads = {"marl": teams.heads[-1], "champion": teams.heads[0]}
+        (scores,) = rollouts.test([Trial(teams.encoder, heads, np.arange(9))])
+        assert (rollouts.episode(teams.at(np.array([0])), 3) == 0).all()
+    for action, p in enumerate(chances):
+        assert_frequency((actions[:-1] == action).sum(), p, 2 * count)
+        both = (actions[:-1] == action).all(axis=1)
+        assert_frequency(both.sum(), p * p, count)  # agents choose independently
+    np.testing.assert_array_equal(actions, again)
+    assert (actions != later).any()
+    assert (usual[:-1] == 0).all()
+    np.testing.assert_array_equal(actions[-1], usual[-1])
+    np.testing.assert_array_equal(alone[:-1], actions[:-1])
+    best = CLIMB_PAYOFFS[0][0]
+    assert all((score.returns == best).all() for score in scores.values())
+
+
+def test_sampled_actions_are_available() -> None:
+    task = task_of("probe/lives")
+    config = sampling(config_of("probe/lives"))
+    with EpisodeRollouts(config, task) as rollouts:
+        replay, _ = generation_of(rollouts, config, teams_of(task.spec, config.n_teams))
+    episodes = jax.tree.map(np.asarray, replay.data)
+    for team in range(config.n_teams):
+        for step in range(int(episodes.length[team])):
+            taken = episodes.action[team, step].astype(int)
+            assert episodes.avail_actions[team, step, np.arange(3), taken].all()
+
+
 # The rollouts of training and of tests.
 
 
-@pytest.mark.parametrize("name", ["probe/lives", "countdown"])
-def test_training_is_the_same_on_host_and_device(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "sampled"), [("probe/lives", False), ("countdown", False), ("probe/lives", True)]
+)
+def test_training_is_the_same_on_host_and_device(name: str, sampled: bool) -> None:
     task = task_of(name)
     config = config_of(name, replay_capacity=13)
+    config = sampling(config) if sampled else config
     teams, found = teams_of(task.spec, config.n_teams), []
     for on_device in (True, False):
         with EpisodeRollouts(config, task, on_device) as rollouts:

@@ -162,6 +162,36 @@ def check_teams(path: Path, config: Config) -> None:
             assert joint.shape == (spec.joint_action_size,)
 
 
+SAMPLED = {"population_actions": "sampled"}
+OWN = {"utility_embedding": "agent"}
+OF_EPISODES = {"vmm_reduction": "sum", "mine_negatives": "episodes"}
+ONE_HEAD = {"team_heads": "shared"}
+
+
+@pytest.mark.parametrize(
+    ("algo", "task", "race"),
+    [
+        ("race", "probe/lives", {**SAMPLED, **OWN, **OF_EPISODES}),
+        pytest.param("race", "probe/lives", ONE_HEAD, marks=pytest.mark.slow),
+        pytest.param("race", "probe/terminates", OWN, marks=pytest.mark.slow),
+        *(
+            pytest.param(algo, "probe/lives", SAMPLED, marks=pytest.mark.slow)
+            for algo in ("merl", "ea", "no-sharing")
+        ),
+    ],
+)
+def test_the_laws_hold_with_other_choices_over_facmac(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, task: str, race: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(learning, "CHUNK", 7)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
+    config = small(algo, "facmac", task, **race)
+    progress = run(tmp_path / "whole", config)
+    check_rows(tmp_path / "whole", config, progress)
+    check_resumption(tmp_path, config)
+    check_teams(tmp_path / "whole", config)
+
+
 @pytest.mark.parametrize(
     ("algo", "base", "task"),
     [
