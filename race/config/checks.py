@@ -24,6 +24,8 @@ MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
 MOST_KEPT = 1000
 """Best teams of a run."""
+MOST_JUDGED = 1000
+"""Generations whose returns are kept of a team."""
 MOST_OBSERVED = 2**20
 """Entries of what an agent observes: networks are dense."""
 MOST_JOINTS = 1000
@@ -180,6 +182,7 @@ def check(config: Config) -> None:
             race.surrogate_probability,
             "from 0 to 1",
         ),
+        *_fitness_rules(race),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         *_population_rules(race),
@@ -311,6 +314,25 @@ def _start_rules(group: str, settings: LearnerConfig | FacmacConfig) -> list[Rul
     return [
         (rate is None or rate > 0, f"{group}.encoder-learning-rate", rate, "above 0"),
         (scale > 0, f"{group}.last-layer-scale", scale, "above 0"),
+    ]
+
+
+def _fitness_rules(race: RaceConfig) -> list[Rule]:
+    generations = race.fitness_generations
+    return [
+        (
+            1 <= generations <= MOST_JUDGED,
+            "race.fitness-generations",
+            generations,
+            f"from 1 to {MOST_JUDGED}",
+        ),
+        (
+            generations == 1 or race.surrogate_probability == 0,
+            "race.fitness-generations",
+            generations,
+            "1 with --race.surrogate-probability above 0: estimates of some generations and "
+            "returns of others have no meaning together",
+        ),
     ]
 
 

@@ -29,6 +29,7 @@ _SHARED_ENCODERS = (
     *("pevfa_target", "policy_embedding", *_SURROGATE),
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
+_DRAWN_ANEW = ("cem", "es")
 _OF_EVOLUTIONS = {
     "ga": (
         *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),
@@ -146,6 +147,9 @@ def _idle_of_population(asked: Config) -> Iterator[tuple[str, str]]:
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)
+    if race.evolution in _DRAWN_ANEW:
+        why = f"with --race.evolution {race.evolution}, which draws every team anew"
+        yield "race.fitness_generations", why
     for evolution, settings in _OF_EVOLUTIONS.items():
         if evolution != race.evolution:
             why = f"with --race.evolution {race.evolution}: it is of {evolution}"

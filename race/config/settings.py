@@ -208,6 +208,9 @@ class RaceConfig:
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
+    fitness_generations: int = 1
+    """Generations over which a team's returns are averaged into its fitness: this one, and those
+    before it in which its heads were what they are now. The encoders have moved in between."""
     surrogate_probability: float = 0.0
     """Probability that a generation judges the population by the beginnings of its episodes and
     what the PeVFA expects after them, as the code does that the paper's evolution is taken from;

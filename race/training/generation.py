@@ -20,6 +20,7 @@ from race.method.normalisation import Observed, observed_more
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.rollouts.beginnings import Beginnings
+from race.training.fitness import Returns, known_returns, means
 from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
@@ -78,16 +79,21 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     """The state with the results of the episodes; the generation's gradient steps are next."""
     progress, returns = state.progress, played.episode_return.tolist()
     n_teams = len(returns) - n_marl
-    fitness, of_marl = returns[:n_teams], returns[n_teams:]
+    fitness, of_marl = tuple(returns[:n_teams]), returns[n_teams:]
+    averaged: Returns = ()
     if played.beginnings is not None:
         fitness = _judged(run, state, played.beginnings)
+    elif fitness and run.config.race.fitness_generations > 1:
+        averaged = _averaged(run, state, fitness)
+        fitness = means(averaged)
     progress = progress.but(
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
         episodes=progress.episodes + len(returns),
         gradient_steps_before=progress.gradient_steps,
         generation=progress.generation + 1,
-        fitness=tuple(fitness),
+        fitness=fitness,
+        returns=averaged,
         marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
         estimated=played.beginnings is not None,
         learning=True,
@@ -96,15 +102,28 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     return _observed(state._replace(progress=progress), played.observed)
 
 
-def _judged(run: Run, state: RunState, begun: Beginnings) -> list[float]:
+def _averaged(run: Run, state: RunState, returns: Sequence[float]) -> Returns:
+    """The returns by which the teams are judged that have played and not yet evolved."""
+    population = run.algorithm.population(state.algorithm)
+    assert population is not None
+    now, before = population.record.now.id, population.record.played.id
+    return known_returns(
+        [(value,) for value in returns],
+        np.asarray(now).tolist(),
+        np.asarray(before).tolist(),
+        state.progress.returns,
+        run.config.race.fitness_generations,
+    )
+
+
+def _judged(run: Run, state: RunState, begun: Beginnings) -> tuple[float, ...]:
     """Discounted returns of the population; the PeVFA guesses what lies behind a beginning.
 
     In the task's own units, whatever rewards are multiplied by for learning.
     """
     values = programs.expected(state.algorithm, begun.state, **run.statics, scaling=state.scaling)
     ahead = np.asarray(values, np.float64) / run.config.env.reward_scale
-    judged: list[float] = (begun.rewards + begun.weight * ahead).tolist()
-    return judged
+    return tuple((begun.rewards + begun.weight * ahead).tolist())
 
 
 def _observed(state: RunState, now: Observed | None) -> RunState:
