@@ -138,6 +138,7 @@ def test_every_setting_is_in_a_shape_or_a_hyper_or_known_to_be_the_hosts() -> No
         "random_steps_owed",
         "marl_episodes",
         "evolution_from",
+        "fitness_episodes",
         "fitness_generations",
         "surrogate_probability",
         "surrogate_steps",

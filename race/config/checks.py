@@ -318,8 +318,21 @@ def _start_rules(group: str, settings: LearnerConfig | FacmacConfig) -> list[Rul
 
 
 def _fitness_rules(race: RaceConfig) -> list[Rule]:
-    generations = race.fitness_generations
+    episodes, generations = race.fitness_episodes, race.fitness_generations
+    exact = race.surrogate_probability == 0
     return [
+        (
+            episodes >= 1 and episodes * race.population_size <= LARGEST_LAYER,
+            "race.fitness-episodes",
+            episodes,
+            f"at least 1, and at most {LARGEST_LAYER} over all teams of the population",
+        ),
+        (
+            episodes == 1 or exact,
+            "race.fitness-episodes",
+            episodes,
+            "1 with --race.surrogate-probability above 0, which judges teams by one beginning each",
+        ),
         (
             1 <= generations <= MOST_JUDGED,
             "race.fitness-generations",
@@ -327,7 +340,7 @@ def _fitness_rules(race: RaceConfig) -> list[Rule]:
             f"from 1 to {MOST_JUDGED}",
         ),
         (
-            generations == 1 or race.surrogate_probability == 0,
+            generations == 1 or exact,
             "race.fitness-generations",
             generations,
             "1 with --race.surrogate-probability above 0: estimates of some generations and "

@@ -53,6 +53,7 @@ _BEFORE: dict[str, Any] = {
     "team_draw": "once",
     "marl_among_teams": False,
     "pevfa_target": "target",
+    "fitness_episodes": 1,
     "fitness_generations": 1,
     "surrogate_probability": 0.0,
     "surrogate_steps": 200,

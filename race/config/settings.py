@@ -208,6 +208,8 @@ class RaceConfig:
     """The PeVFA serves the MARL team too, and there is no other critic (Section 3.2)."""
     marl_episodes: int = 1
     """Episodes of the MARL team in a generation, for one of each team of the population."""
+    fitness_episodes: int = 1
+    """Episodes of each team of the population in a generation; their mean return is its fitness."""
     fitness_generations: int = 1
     """Generations over which a team's returns are averaged into its fitness: this one, and those
     before it in which its heads were what they are now. The encoders have moved in between."""
@@ -364,9 +366,14 @@ class Config:
         return self.race.marl_episodes if self.has_population else 1
 
     @property
+    def n_population_teams(self) -> int:
+        """Episodes of the population in a generation, all at once."""
+        return self.race.population_size * self.race.fitness_episodes * self.has_population
+
+    @property
     def n_teams(self) -> int:
-        """Teams that act: the population and the MARL team, as often as it plays."""
-        return self.race.population_size * self.has_population + self.n_marl_teams
+        """Teams that act at once: the population and the MARL team, as often as they play."""
+        return self.n_population_teams + self.n_marl_teams
 
     @property
     def method(self) -> str:

@@ -48,7 +48,8 @@ class Score(NamedTuple):
 class Play(NamedTuple):
     """The teams of one run that play a generation: the population, then the MARL team.
 
-    The MARL team alone explores; it plays as often as ``n_marl`` says. ``generation`` counts from
+    A team that plays several episodes is there as often. The MARL team alone explores; it plays as
+    often as ``n_marl`` says. ``generation`` counts from
     0, ``env_steps`` were made before; all steps go into the buffer, if it has room at all.
     """
 
@@ -79,7 +80,10 @@ class Trial(NamedTuple):
 
 
 class Generation(NamedTuple):
-    """What the episodes of one generation came to, one of each acting team."""
+    """What the episodes of one generation came to, one of each acting team.
+
+    A team that plays several counts as so many.
+    """
 
     episode_return: NDArray[np.float64]  # [T]
     env_steps: int

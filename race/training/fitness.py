@@ -2,8 +2,15 @@
 
 from collections.abc import Sequence
 
+from race.config.settings import Config
+
 Returns = tuple[tuple[float, ...], ...]
 """Of each team those of some of its episodes, the oldest first."""
+
+
+def averages(config: Config) -> bool:
+    """Whether fitness is the mean of several returns, of some teams at least."""
+    return max(config.race.fitness_episodes, config.race.fitness_generations) > 1
 
 
 def known_returns(

@@ -20,7 +20,7 @@ from race.method.normalisation import Observed, observed_more
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.rollouts.beginnings import Beginnings
-from race.training.fitness import Returns, known_returns, means
+from race.training.fitness import Returns, averages, known_returns, means
 from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
@@ -51,15 +51,14 @@ def warm_up(run: Run, state: RunState) -> RunState:
 
 
 def to_play(run: Run, state: RunState) -> Play:
-    """Lines 3 to 6: the teams of a generation, each of which plays one episode."""
+    """Lines 3 to 6: the teams of a generation, each as often as it plays an episode."""
     progress, config = state.progress, run.config
     run.report("rollouts", progress, {})
     teams = run.algorithm.teams(state.algorithm, run.task.spec, run.statics["shape"])
     n_marl = config.n_marl_teams
     if progress.env_steps - progress.random_steps < config.race.evolution_from and n_marl:
         teams = teams.at(slice(teams.count - 1, None))  # of a population nobody plays yet
-    if n_marl:
-        teams = teams.last_again(n_marl)
+    teams = teams.again(config.race.fitness_episodes, n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
     judged_early = teams.count > n_marl and _surrogate_due(config, progress)
     steps = config.race.surrogate_steps if judged_early else None
@@ -83,7 +82,7 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     averaged: Returns = ()
     if played.beginnings is not None:
         fitness = _judged(run, state, played.beginnings)
-    elif fitness and run.config.race.fitness_generations > 1:
+    elif fitness and averages(run.config):
         averaged = _averaged(run, state, fitness)
         fitness = means(averaged)
     progress = progress.but(
@@ -103,14 +102,20 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
 
 
 def _averaged(run: Run, state: RunState, returns: Sequence[float]) -> Returns:
-    """The returns by which the teams are judged that have played and not yet evolved."""
+    """The returns by which the teams are judged that have played and not yet evolved.
+
+    Args:
+        run: the run.
+        state: its state.
+        returns: of this generation, all teams and then all again.
+    """
     population = run.algorithm.population(state.algorithm)
     assert population is not None
-    now, before = population.record.now.id, population.record.played.id
+    now, before = (np.asarray(of.id) for of in (population.record.now, population.record.played))
     return known_returns(
-        [(value,) for value in returns],
-        np.asarray(now).tolist(),
-        np.asarray(before).tolist(),
+        np.reshape(returns, (-1, len(now))).T.tolist(),
+        now.tolist(),
+        before.tolist(),
         state.progress.returns,
         run.config.race.fitness_generations,
     )

@@ -42,7 +42,7 @@ class Progress:
     place of them; empty without one."""
     returns: tuple[tuple[float, ...], ...] = ()
     """The returns whose means these are, of each team's episodes, the oldest first; empty where
-    each is the return of one episode."""
+    settings ask for one episode of one generation."""
     marl_return: float | None = 0.0
     """Training return of the MARL team in the newest generation, the mean of its episodes; None
     where there is no such team."""

@@ -66,6 +66,8 @@ def refused(config: Config, **facts: bool) -> str:
 def read_on_host(config: Config, group: str, name: str) -> bool:
     """Settings that neither `Shape` nor `Hyper` shows."""
     if group == "race":
+        if name == "fitness_episodes":
+            return config.has_population
         if name == "fitness_generations":
             return config.has_population and config.race.evolution not in ("cem", "es")
         beside = config.has_population and config.has_marl

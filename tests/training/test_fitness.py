@@ -1,4 +1,4 @@
-"""What a population is judged by: returns of several generations."""
+"""What a population is judged by: returns of several episodes and generations."""
 
 import dataclasses
 import itertools
@@ -6,20 +6,26 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from test_cohort import assert_near, train_all
 from test_laws import POPULATION, check_resumption, check_rows, small
 from whole_runs import rows, run
 
+from race.algorithms.base import Teams
+from race.config.cohort import Batching
 from race.errors import ConfigError, DivergenceError
 from race.replay.buffer import Replay
 from race.rollouts.base import Generation, Play
 from race.rollouts.discrete import EpisodeRollouts
 from race.rollouts.transitions import TransitionRollouts
+from race.runs import checkpoints
 from race.training import learning
 from race.training.fitness import known_returns, means
+from race.training.run_state import Progress
 
 # --- which returns count ----------------------------------------------------------------------
 
@@ -97,9 +103,9 @@ def returned(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
 
 GENERATIONS = [
     ("race", "matd3", "probe/target", {}),
-    ("ea", "matd3", "probe/target", {}),
+    ("ea", "matd3", "probe/target", {"fitness_episodes": 2}),
     pytest.param("merl", "facmac", "probe/lives", {}, marks=pytest.mark.slow),
-    pytest.param("race", "facmac", "probe/lives", {}, marks=pytest.mark.slow),
+    pytest.param("race", "facmac", "probe/lives", {"fitness_episodes": 3}, marks=pytest.mark.slow),
     pytest.param("race", "matd3", "probe/target", {"evolution_from": 20}, marks=pytest.mark.slow),
 ]
 
@@ -158,10 +164,95 @@ def test_means_may_name_another_elite_than_the_last_episode(
     assert others
 
 
+@pytest.mark.parametrize(
+    ("algo", "base", "task", "steps"),
+    [
+        ("ea", "matd3", "probe/time-limit", 10),
+        pytest.param("race", "matd3", "probe/time-limit", 10, marks=pytest.mark.slow),
+        pytest.param("merl", "facmac", "probe/climb", 1, marks=pytest.mark.slow),
+    ],
+)
+def test_all_episodes_of_a_team_count_and_are_stored(
+    tmp_path: Path, returned: list[list[float]], algo: str, base: str, task: str, steps: int
+) -> None:
+    config = small(algo, base, task, fitness_episodes=3)
+    config = dataclasses.replace(config, env_steps=60 * steps)
+    progress = run(tmp_path, config)
+    before = progress.random_steps
+    episodes = 3 * POPULATION + config.has_marl
+    for row, found in zip(rows(tmp_path, "generation"), returned, strict=True):
+        assert len(found) == episodes == config.n_teams
+        assert row["env_steps"] - before == episodes * steps
+        before = row["env_steps"]
+        assert all(len(team["returns"]) == 3 for team in row["teams"])
+    assert progress.episodes == episodes * progress.generation
+    newest = checkpoints.newest(tmp_path / "checkpoints")
+    assert newest is not None
+    stored = progress.episodes if config.discrete else progress.env_steps
+    assert checkpoints.load(newest).rows["replay"].inserted == stored * config.has_marl
+    if not config.discrete:
+        assert progress.gradient_steps == (progress.env_steps - progress.random_steps) * (
+            config.has_marl
+        )
+
+
+def test_a_team_plays_unlike_episodes(tmp_path: Path) -> None:
+    run(tmp_path, small("ea", "matd3", "probe/target", fitness_episodes=2))
+    both = [team["returns"] for row in rows(tmp_path, "generation") for team in row["teams"]]
+    assert all(first != second for first, second in both)
+
+
+@pytest.mark.parametrize("own", [False, True])
+def test_teams_are_there_as_often_as_they_play(own: bool) -> None:
+    encoder = np.arange(3.0)[:, None] * np.ones((3, 2)) if own else np.ones(2)
+    teams = Teams(encoder, jnp.arange(3.0)[:, None, None, None] * jnp.ones((3, 1, 2, 1)), own)
+    assert teams.again(1, 1) is teams.again(1, 0) is teams
+    cases = {(1, 3): [0, 1, 2, 2, 2], (2, 1): [0, 1, 0, 1, 2], (2, 0): [0, 1, 2, 0, 1, 2]}
+    for (population, marl), expected in cases.items():
+        found = teams.again(population, marl)
+        assert found.heads[:, 0, 0, 0].tolist() == expected
+        assert found.own_encoders == own
+        if own:
+            assert found.encoder[:, 1].tolist() == expected
+        else:
+            assert found.encoder is encoder
+    alone = teams.at(slice(2, None))  # the MARL team before anything evolves
+    assert alone.again(4, 2).heads[:, 0, 0, 0].tolist() == [2, 2]
+
+
 def test_one_episode_of_one_generation_is_told_as_ever(tmp_path: Path) -> None:
     progress = run(tmp_path, small("ea", "matd3", "probe/target"))
     assert progress.returns == ()
     assert all("returns" not in t for row in rows(tmp_path, "generation") for t in row["teams"])
+
+
+@pytest.mark.parametrize(
+    ("algo", "task"),
+    [
+        ("ea", "probe/target"),
+        pytest.param("race", "probe/target", marks=pytest.mark.slow),
+        pytest.param("merl", "probe/lives", marks=pytest.mark.slow),
+    ],
+)
+@pytest.mark.parametrize("batching", ["map", "vmap"])
+def test_runs_of_a_cohort_are_judged_as_alone(
+    tmp_path: Path, returned: list[list[float]], algo: str, task: str, batching: Batching
+) -> None:
+    base = "facmac" if task == "probe/lives" else "matd3"
+    config = small(algo, base, task, fitness_episodes=2, fitness_generations=2)
+    made = [dataclasses.replace(config, seed=seed) for seed in (1, 2)]
+    results = train_all(tmp_path / "together", made, batching)
+    assert [type(result) for result in results] == [Progress, Progress]
+    for one in made:
+        run(tmp_path / f"{one.seed}", one)
+        found, expected = (
+            rows(tmp_path / "together" / f"seed{one.seed}"),
+            rows(tmp_path / f"{one.seed}"),
+        )
+        if batching == "map" or algo == "ea":
+            assert found == expected
+        else:
+            assert_near(found, expected)
 
 
 # --- what is refused --------------------------------------------------------------------------
@@ -171,6 +262,9 @@ def test_one_episode_of_one_generation_is_told_as_ever(tmp_path: Path) -> None:
     ("race", "told"),
     [
         ({"fitness_generations": 0}, "--race.fitness-generations is 0"),
+        ({"fitness_episodes": 0}, "--race.fitness-episodes is 0"),
+        ({"fitness_episodes": 4000}, "--race.fitness-episodes is 4000.* over all teams"),
+        ({"fitness_episodes": 2, "surrogate_probability": 0.5}, "--race.surrogate-probability"),
         ({"fitness_generations": 2, "surrogate_probability": 0.5}, "--race.surrogate-probability"),
     ],
 )
