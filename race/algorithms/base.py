@@ -38,7 +38,7 @@ class Teams(eqx.Module):
         if population == 1 and marl <= 1:
             return self
         first = np.arange(self.count - (marl > 0))
-        return self.at(np.concatenate([np.tile(first, population), [self.count - 1] * marl]))
+        return self.at(np.r_[np.tile(first, population), np.full(marl, self.count - 1)])
 
     def at(self, places: Any) -> "Teams":
         """The teams of some places."""

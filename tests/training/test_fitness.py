@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_cohort import assert_near, train_all
 from test_laws import POPULATION, check_resumption, check_rows, small
@@ -59,6 +59,7 @@ def test_several_episodes_of_each_generation_count_alike() -> None:
     ),
     generations=st.integers(1, 4),
 )
+@settings(deadline=None)
 def test_fitness_is_the_mean_since_a_team_changed(
     script: list[list[tuple[bool, float]]], generations: int
 ) -> None:
