@@ -264,9 +264,13 @@ def policy_values(
     episodes: list[One],
     critic: Any,
     pevfa: Any = None,
+    seen: np.ndarray | None = None,
 ) -> float:
-    """``E_D[Q(s, pi(s))]`` of a team, of ``Q_theta`` if there is a PeVFA."""
-    e = NONE if pevfa is None else policy_embedding(pevfa, head)
+    """``E_D[Q(s, pi(s))]`` of a team, of ``Q_theta`` if there is a PeVFA.
+
+    ``seen``: the team that the PeVFA sees in place of the one that acts.
+    """
+    e = NONE if pevfa is None else policy_embedding(pevfa, head if seen is None else seen)
     values = []
     for one, noise, hard, anchor in zip(episodes, *samples, strict=True):
         u = hard + softmax(perturbed(embeddings(encoder, one), head, one, noise)) - anchor

@@ -346,6 +346,12 @@ def _fitness_rules(race: RaceConfig) -> list[Rule]:
             "1 with --race.surrogate-probability above 0: estimates of some generations and "
             "returns of others have no meaning together",
         ),
+        (
+            generations == 1 or race.head_learning_rate == 0,
+            "race.fitness-generations",
+            generations,
+            "1 with --race.head-learning-rate above 0: teams that learn do not stay what they were",
+        ),
     ]
 
 
@@ -356,7 +362,7 @@ def _population_rules(race: RaceConfig) -> list[Rule]:
         *("strong_share", "reset_share", "cem_elite_share", "cem_noise_decay"),
     )
     not_negative = (
-        *("vmm_weight", "vfm_marl_weight", "vfm_team_weight"),
+        *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "head_learning_rate"),
         *("strong_strength", "mild_strength", "cem_noise_start", "cem_noise_end"),
     )
     above_0 = ("es_noise", "es_learning_rate")

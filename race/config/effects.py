@@ -26,7 +26,7 @@ _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
-    *("pevfa_target", "policy_embedding", *_SURROGATE),
+    *("pevfa_target", "policy_embedding", "head_learning_rate", *_SURROGATE),
 )
 _BESIDE_MARL = ("injection_probability", "marl_episodes", "evolution_from")
 _DRAWN_ANEW = ("cem", "es")

@@ -35,6 +35,7 @@ _BEFORE: dict[str, Any] = {
     "step_seconds": None,
     "vfm_marl_weight": 1.0,
     "vfm_team_weight": 1.0,
+    "head_learning_rate": 0.0,
     "value_awareness": 1.0,
     "crossover_probability": 1.0,
     "injection_probability": 1.0,

@@ -159,6 +159,9 @@ class RaceConfig:
     """Weight of the MARL team's value in what the encoders climb, the first term of Eq. (2)."""
     vfm_team_weight: float = 1.0
     """Weight of a population team's value there, the second term of Eq. (2)."""
+    head_learning_rate: float = 0.0
+    """Step size at which the team W_j of Eq. (2) climbs its own value with the encoders, by plain
+    gradient steps on its heads. 0: the population changes by evolution alone."""
     value_awareness: float = 1.0
     """How much the mutual information of a state counts by its value: 1 as in Eq. (5), 0 not at
     all, so that every state has the weight 1."""

@@ -54,6 +54,8 @@ class Shape:
     marl_among_teams: bool
     pevfa_target: PevfaTarget
     policy_embedding: PolicyEmbedding
+    heads_learn: bool
+    """Whether the team of Eq. (2) climbs its value too."""
     one_pevfa: bool
     shared_agents: bool
 
@@ -100,6 +102,7 @@ def shape_of(config: Config) -> Shape:
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",
+        heads_learn=race.head_learning_rate > 0 and represents,
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

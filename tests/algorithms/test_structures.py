@@ -312,7 +312,10 @@ def test_teams_of_a_gradient_step(
     heads = jnp.arange(5.0)[:, None, None, None] * jnp.ones((5, 2, 5, 2))
     marl_head = jnp.full((2, 5, 2), 5.0)
     draw = jax.jit(jax.vmap(lambda key: draw_teams(heads, marl_head, key, tiny_spec, shape)))
-    first, second = (np.asarray(team)[:, 0, 0, 0] for team in draw(KEYS))
+    drawn = draw(KEYS)
+    first, second = (np.asarray(team.heads)[:, 0, 0, 0] for team in drawn)
+    for team, found in zip(drawn, (first, second), strict=True):
+        np.testing.assert_array_equal(team.place, found)
     n = 5 + marl_among_teams
     for found in (first, second):
         for team in range(n):

@@ -36,6 +36,7 @@ OTHER: dict[str, Any] = {
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
+    "head_learning_rate": 1e-3,
 }
 SETTINGS = [
     (group, field.name)

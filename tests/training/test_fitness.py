@@ -266,6 +266,7 @@ def test_runs_of_a_cohort_are_judged_as_alone(
         ({"fitness_episodes": 0}, "--race.fitness-episodes is 0"),
         ({"fitness_episodes": 4000}, "--race.fitness-episodes is 4000.* over all teams"),
         ({"fitness_episodes": 2, "surrogate_probability": 0.5}, "--race.surrogate-probability"),
+        ({"fitness_generations": 2, "head_learning_rate": 0.1}, "--race.head-learning-rate"),
         ({"fitness_generations": 2, "surrogate_probability": 0.5}, "--race.surrogate-probability"),
     ],
 )
