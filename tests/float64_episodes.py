@@ -272,12 +272,17 @@ def policy_values(
     episodes: list[One],
     critic: Any,
     pevfa: Any = None,
+    seen: np.ndarray | None = None,
 ) -> float:
-    """``E_D[Q(s, pi(s))]`` of a team, of ``Q_theta`` if there is a PeVFA."""
+    """``E_D[Q(s, pi(s))]`` of a team, of ``Q_theta`` if there is a PeVFA.
+
+    ``seen``: the team that the PeVFA sees in place of the one that acts.
+    """
+    seen = head if seen is None else seen
     values = []
     for one, noise, hard, anchor in zip(episodes, *samples, strict=True):
         u = hard + softmax(perturbed(embeddings(encoder, one), head, one, noise)) - anchor
-        values.append(q_tot(critic, one.obs[:-1], one.state[:-1], u, pevfa, head))
+        values.append(q_tot(critic, one.obs[:-1], one.state[:-1], u, pevfa, seen))
     return mean(values)
 
 

@@ -123,6 +123,8 @@ def test_shapes_tell_what_is_compiled_anew() -> None:
     assert shape_of(continuous("race", race={"population_size": 6})) != base
     assert shape_of(continuous("race", race={"mutation_draw": "weight"})) != base
     assert shape_of(continuous("race", policy_delay=3)) != base
+    learning = [shape_of(continuous("race", race={"head_learning_rate": x})) for x in (0.1, 0.2)]
+    assert learning[0] == learning[1] != base
     assert shape_of(continuous("race", layer_norm=False)) != base
     # What belongs to a population has no say without one.
     alone = shape_of(continuous("matd3"))
@@ -140,6 +142,8 @@ def test_every_setting_is_in_a_shape_or_a_hyper_or_known_to_be_the_hosts() -> No
         "population_actions",
         "evolution_from",
         "replayed",
+        "fitness_episodes",
+        "fitness_generations",
         "surrogate_probability",
         "surrogate_steps",
         "sharing",  # chooses the algorithm

@@ -28,11 +28,17 @@ class Teams(eqx.Module):
         """T."""
         return int(self.heads.shape[0])
 
-    def last_again(self, times: int) -> "Teams":
-        """The last team so many times instead of once."""
-        if times == 1:
+    def again(self, population: int, marl: int) -> "Teams":
+        """The teams as often as they play: the population first, one round after the other.
+
+        Args:
+            population: how often each of its teams plays.
+            marl: how often the last team does, which is the MARL team; 0 if there is none.
+        """
+        if population == 1 and marl <= 1:
             return self
-        return self.at(np.r_[: self.count - 1, [self.count - 1] * times])
+        first = np.arange(self.count - (marl > 0))
+        return self.at(np.r_[np.tile(first, population), np.full(marl, self.count - 1)])
 
     def at(self, places: Any) -> "Teams":
         """The teams of some places."""

@@ -22,7 +22,10 @@ OPERATORS = ("crossover", "mutation", "crossover_and_mutation")
 
 
 class Lineage(NamedTuple):
-    """Of each team: an id that lasts as long as the team is unchanged, and where it comes from."""
+    """Of each team: an id that lasts as long as the team is unchanged, and where it comes from.
+
+    Unchanged by evolution: what heads learn beside it, where they do, does not count.
+    """
 
     id: Int[Array, "P"]
     origin: Int[Array, "P"]  # of `ORIGINS`

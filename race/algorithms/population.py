@@ -21,7 +21,7 @@ class Population(NamedTuple):
     """The teams, their roles in the last evolution, and where they come from."""
 
     teams: Team  # leaves [P, N, ...]
-    champion: Team  # that of the highest fitness, as it played
+    champion: Team  # that of the highest fitness, as it played, whatever its heads learn later
     elite: Int[Array, ""]  # where it is, or was if the evolution keeps no teams
     worst: Int[Array, ""]  # the place that the MARL team takes
     injected: Int[Array, ""]  # where the MARL team was put last, -1 before the first time

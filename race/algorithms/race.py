@@ -104,20 +104,29 @@ def update(
     learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
     policies = parameters(state.policies)
-    team, climbing = draw_teams(state.heads, policies.head, team_key, spec, shape)
+    team, climbing = draw_teams(state.heads, policies.head, team_key, shape)
     samples = learner.now(batch, spec)
     critics, critic_losses, value = train_critics(
-        state.critics, state.target, policies, batch, samples, team, critic_key, spec, shape, hyper
+        state.critics,
+        state.target,
+        policies,
+        batch,
+        samples,
+        of_all_agents(team.heads, spec),
+        critic_key,
+        spec,
+        shape,
+        hyper,
     )
 
-    def policy_step(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:
+    def policy_step(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses, Any]:
         policies, target = moving
         return train_policies(
             policies,
             critics,
             target,
             samples,
-            climbing,
+            climbing.heads,
             value,
             step,
             policy_key,
@@ -126,15 +135,26 @@ def update(
             hyper,
         )
 
-    def idle(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses]:
-        return *moving, {name: jnp.zeros(()) for name in POLICY_LOSSES}
+    def idle(moving: tuple[Policies, Targets]) -> tuple[Policies, Targets, Losses, Any]:
+        losses = {name: jnp.zeros(()) for name in POLICY_LOSSES}
+        return *moving, losses, climbing.heads if shape.heads_learn else None
 
     # The population stays outside: what goes through a branch may be copied at each step.
-    policies, target, policy_losses = when(
+    policies, target, policy_losses, climbed = when(
         learner.policy_due(step, shape), policy_step, idle, (state.policies, state.target)
     )
     moved = state._replace(policies=policies, critics=critics, target=target)
+    if climbed is not None:
+        moved = moved._replace(population=_with_heads(state.population, climbing.place, climbed))
     return moved, critic_losses, policy_losses
+
+
+def _with_heads(
+    population: Population, place: Int[Array, ""], heads: Float[Array, "_ H1 A"]
+) -> Population:
+    """The population in which a team has other heads; the MARL team, drawn, has no place there."""
+    everyone = population.teams.heads.at[place].set(heads, mode="drop")
+    return population._replace(teams=population.teams._replace(heads=everyone))
 
 
 def expected(

@@ -25,7 +25,13 @@ from race.method.equations import (
     value_function_maximization_loss,
     value_weights,
 )
-from race.networks.optimization import descend_all, graft, parameters, weigh_gradient
+from race.networks.optimization import (
+    descend_all,
+    descend_plainly,
+    graft,
+    parameters,
+    weigh_gradient,
+)
 from race.types import Spec
 
 Losses = dict[str, Float[Array, ""]]
@@ -58,6 +64,13 @@ class Policies(NamedTuple):
     mine: Any  # T_omega
 
 
+class Drawn(NamedTuple):
+    """A team that was drawn, with the heads that are kept of it: one where its agents share it."""
+
+    heads: Float[Array, "_ H1 A"]
+    place: Int[Array, ""]  # in the population; P is the MARL team
+
+
 def of_all_agents(head: Float[Array, "_ H1 A"], spec: Spec) -> Float[Array, "N H1 A"]:
     """A team with a head for every agent, also where its agents share one."""
     return jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
@@ -85,18 +98,18 @@ def draw_teams(
     heads: Float[Array, "P _ H1 A"],
     marl_head: Float[Array, "_ H1 A"],
     key: PRNGKeyArray,
-    spec: Spec,
     shape: Shape,
-) -> tuple[Float[Array, "N H1 A"], Float[Array, "N H1 A"]]:
+) -> tuple[Drawn, Drawn]:
     """The team W_j of Eq. (1) and that of Eq. (2), of the population or of all teams."""
     n = shape.population_size + shape.marl_among_teams
 
-    def team(key: PRNGKeyArray) -> Float[Array, "N H1 A"]:
+    def team(key: PRNGKeyArray) -> Drawn:
         place = jax.random.randint(key, (), 0, n)
         if not shape.marl_among_teams:
-            return of_all_agents(heads[place], spec)
-        drawn = of_all_agents(heads[jnp.minimum(place, n - 2)], spec)
-        return jnp.where(place == n - 1, of_all_agents(marl_head, spec), drawn)
+            return Drawn(heads[place], place)
+        drawn = heads[jnp.minimum(place, n - 2)]
+        marl = jnp.broadcast_to(marl_head, drawn.shape)
+        return Drawn(jnp.where(place == n - 1, marl, drawn), place)
 
     first = team(key)
     return first, first if shape.team_draw == "once" else team(jax.random.fold_in(key, 2))
@@ -161,17 +174,21 @@ def train_policies(
     critics: Critics,
     target: Targets,
     samples: Samples,
-    team: Float[Array, "N H1 A"],
+    kept: Float[Array, "_ H1 A"],
     value: Float[Array, "B"],
     step: Int[Array, ""],
     key: PRNGKeyArray,
     spec: Spec,
     shape: Shape,
     hyper: Hyper,
-) -> tuple[Policies, Targets, Losses]:
-    """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE."""
+) -> tuple[Policies, Targets, Losses, Float[Array, "_ H1 A"] | None]:
+    """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE.
+
+    Also returns the team W_j after a step of its own, where heads of the population learn.
+    """
     learner = learner_of(shape)
     now, _, mask = samples
+    team = of_all_agents(kept, spec)
     marl_key, team_key, pairs_key = jax.random.split(key, 3)
     of_critics = parameters(critics)
     critic = None if shape.one_pevfa else learner.first_critic(of_critics.critic)
@@ -182,7 +199,7 @@ def train_policies(
         assert learner.episodes is not None
         episodes = learner.episodes(now)
 
-    def loss(policies: Policies) -> tuple[Float[Array, ""], Losses]:
+    def loss(policies: Policies, own: Any) -> tuple[Float[Array, ""], Losses]:
         z = learner.encode(policies.encoder, now, spec)
         # The weights of Eq. (2)'s terms are of what goes on into the encoders: W_marl learns by
         # Eq. (7) whatever they are. They multiply gradients of actions, the smallest arrays there
@@ -195,6 +212,10 @@ def train_policies(
         )
         team_action = learner.act(z, team, now, team_key, spec)
         team_action = weigh_gradient(team_action, hyper.vfm_team_weight)
+        if shape.heads_learn:
+            # As for W_marl: the weight is of the encoders' part, and W_j climbs through actions.
+            climbing = learner.act(fixed_z, of_all_agents(own, spec), now, team_key, spec)
+            team_action = graft(climbing, team_action)
         q_marl = _marl_values(critic, pevfa, now, marl_action, policies.head, spec, shape)[0]
         q_team = learner.q_team(pevfa, now, team_action, team, spec)[0]
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
@@ -219,11 +240,18 @@ def train_policies(
         }
         return total, losses
 
-    gradient, losses = jax.grad(loss, has_aux=True)(parameters(policies))
+    own = kept if shape.heads_learn else None
+    (gradient, of_team), losses = jax.grad(loss, argnums=(0, 1), has_aux=True)(
+        parameters(policies), own
+    )
+    if own is not None:
+        # Beyond the paper, whose population evolves alone. A memory of gradients would be another
+        # team's after evolution, so that there is none.
+        own = descend_plainly(own, of_team, hyper.head_learning_rate, hyper.gradient_clip)
     rates = Policies(
         hyper.encoder_learning_rate, hyper.actor_learning_rate, hyper.critic_learning_rate
     )
     policies = descend_all(policies, gradient, rates, hyper.gradient_clip)
     trained = parameters(policies)
     online = Targets(trained.encoder, trained.head, of_critics.critic, of_critics.pevfa)
-    return policies, learner.follow(target, online, step, shape, hyper), losses
+    return policies, learner.follow(target, online, step, shape, hyper), losses, own

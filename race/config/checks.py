@@ -24,6 +24,8 @@ MOST_TRANSITIONS = 2**30
 """Transitions in a replay buffer, which counts them with 32 bits."""
 MOST_KEPT = 1000
 """Best teams of a run."""
+MOST_JUDGED = 1000
+"""Generations whose returns are kept of a team."""
 MOST_OBSERVED = 2**20
 """Entries of what an agent observes: networks are dense."""
 MOST_JOINTS = 1000
@@ -180,6 +182,7 @@ def check(config: Config) -> None:
             race.surrogate_probability,
             "from 0 to 1",
         ),
+        *_fitness_rules(race),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         (
@@ -327,6 +330,44 @@ def _start_rules(group: str, settings: LearnerConfig | FacmacConfig) -> list[Rul
     ]
 
 
+def _fitness_rules(race: RaceConfig) -> list[Rule]:
+    episodes, generations = race.fitness_episodes, race.fitness_generations
+    exact = race.surrogate_probability == 0
+    return [
+        (
+            episodes >= 1 and episodes * race.population_size <= LARGEST_LAYER,
+            "race.fitness-episodes",
+            episodes,
+            f"at least 1, and at most {LARGEST_LAYER} over all teams of the population",
+        ),
+        (
+            episodes == 1 or exact,
+            "race.fitness-episodes",
+            episodes,
+            "1 with --race.surrogate-probability above 0, which judges teams by one beginning each",
+        ),
+        (
+            1 <= generations <= MOST_JUDGED,
+            "race.fitness-generations",
+            generations,
+            f"from 1 to {MOST_JUDGED}",
+        ),
+        (
+            generations == 1 or exact,
+            "race.fitness-generations",
+            generations,
+            "1 with --race.surrogate-probability above 0: estimates of some generations and "
+            "returns of others have no meaning together",
+        ),
+        (
+            generations == 1 or race.head_learning_rate == 0,
+            "race.fitness-generations",
+            generations,
+            "1 with --race.head-learning-rate above 0: teams that learn do not stay what they were",
+        ),
+    ]
+
+
 def _population_rules(race: RaceConfig) -> list[Rule]:
     shares = (
         *("mutation_fraction", "mutation_probability", "agent_mutation_probability"),
@@ -334,7 +375,7 @@ def _population_rules(race: RaceConfig) -> list[Rule]:
         *("strong_share", "reset_share", "cem_elite_share", "cem_noise_decay"),
     )
     not_negative = (
-        *("vmm_weight", "vfm_marl_weight", "vfm_team_weight"),
+        *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "head_learning_rate"),
         *("strong_strength", "mild_strength", "cem_noise_start", "cem_noise_end"),
     )
     above_0 = ("es_noise", "es_learning_rate")

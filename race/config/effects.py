@@ -27,12 +27,13 @@ _HOST = ("processes", "retries", "step_seconds")
 _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
-    *("pevfa_target", "policy_embedding", "utility_embedding", *_SURROGATE),
+    *("pevfa_target", "policy_embedding", "utility_embedding", "head_learning_rate", *_SURROGATE),
     *(*_OF_EPISODES, "team_heads"),
 )
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
 )
+_DRAWN_ANEW = ("cem", "es")
 _OF_EVOLUTIONS = {
     "ga": (
         *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),
@@ -153,6 +154,9 @@ def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, st
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)
+    if race.evolution in _DRAWN_ANEW:
+        why = f"with --race.evolution {race.evolution}, which draws every team anew"
+        yield "race.fitness_generations", why
     for evolution, settings in _OF_EVOLUTIONS.items():
         if evolution != race.evolution:
             why = f"with --race.evolution {race.evolution}: it is of {evolution}"

@@ -55,6 +55,8 @@ class Hyper(NamedTuple):
     vfm_marl_weight: Number
     vfm_team_weight: Number
     """Weights of the two terms of Eq. (2)."""
+    head_learning_rate: Number
+    """Of the population's heads; 0 where evolution alone changes them (`Shape.heads_learn`)."""
     value_awareness: Number
     """1: Eq. (5) with its weights; 0: with all weights 1."""
 
@@ -97,6 +99,7 @@ def hyper_of(config: Config) -> Hyper:
     idle = set()
     if config.whole_teams:
         idle |= {"vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"}
+        idle |= {"head_learning_rate"}
     if not config.has_marl:
         idle |= {"injection_probability", "own_share", *_OF_GRADIENTS}
     if config.has_population:

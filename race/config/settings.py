@@ -165,6 +165,9 @@ class RaceConfig:
     """Weight of the MARL team's value in what the encoders climb, the first term of Eq. (2)."""
     vfm_team_weight: float = 1.0
     """Weight of a population team's value there, the second term of Eq. (2)."""
+    head_learning_rate: float = 0.0
+    """Step size at which the team W_j of Eq. (2) climbs its own value with the encoders, by plain
+    gradient steps on its heads. 0: the population changes by evolution alone."""
     value_awareness: float = 1.0
     """How much the mutual information of a state counts by its value: 1 as in Eq. (5), 0 not at
     all, so that every state has the weight 1."""
@@ -236,6 +239,11 @@ class RaceConfig:
     replayed: Replayed = "all"
     """Whose experience of a generation goes into the replay buffer: that of all teams, or, of the
     population, of the better ones alone, which returned no less than its median."""
+    fitness_episodes: int = 1
+    """Episodes of each team of the population in a generation; their mean return is its fitness."""
+    fitness_generations: int = 1
+    """Generations over which a team's returns are averaged into its fitness: this one, and those
+    before it in which its heads were what they are now. The encoders have moved in between."""
     surrogate_probability: float = 0.0
     """Probability that a generation judges the population by the beginnings of its episodes and
     what the PeVFA expects after them, as the code does that the paper's evolution is taken from;
@@ -400,9 +408,14 @@ class Config:
         return self.has_population and self.race.own_share is not None
 
     @property
+    def n_population_teams(self) -> int:
+        """Episodes of the population in a generation, all at once."""
+        return self.race.population_size * self.race.fitness_episodes * self.has_population
+
+    @property
     def n_teams(self) -> int:
-        """Teams that act: the population and the MARL team, as often as it plays."""
-        return self.race.population_size * self.has_population + self.n_marl_teams
+        """Teams that act at once: the population and the MARL team, as often as they play."""
+        return self.n_population_teams + self.n_marl_teams
 
     @property
     def method(self) -> str:

@@ -62,6 +62,8 @@ class Shape:
     vmm_reduction: VmmReduction
     mine_negatives: MineNegatives
     team_heads: TeamHeads
+    heads_learn: bool
+    """Whether the team of Eq. (2) climbs its value too."""
     one_pevfa: bool
     shared_agents: bool
 
@@ -112,6 +114,7 @@ def shape_of(config: Config) -> Shape:
         vmm_reduction=race.vmm_reduction if represents and discrete else "mean",
         mine_negatives=race.mine_negatives if represents and discrete else "steps",
         team_heads="shared" if config.one_head else "agent",
+        heads_learn=race.head_learning_rate > 0 and represents,
         one_pevfa=race.one_pevfa and represents,
         shared_agents=learner.shared_agents and not discrete,
     )

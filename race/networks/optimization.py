@@ -43,6 +43,12 @@ def descend(trained: Trainable, gradient: Any, learning_rate: Number, clip: Numb
     return Trainable(optax.apply_updates(trained.params, updates), optimizer)
 
 
+def descend_plainly(params: Any, gradient: Any, learning_rate: Number, clip: Number) -> Any:
+    """One step against a gradient whose global norm is first clipped; nothing is remembered."""
+    clipped, _ = _clip_by_global_norm(clip).update(gradient, optax.EmptyState())
+    return jax.tree.map(lambda p, g: p - learning_rate * g, params, clipped)
+
+
 def parameters(trained: Any) -> Any:
     """The parameters of a tuple of `Trainable`, in a tuple of its kind; what is None stays None."""
     return type(trained)(*(None if part is None else part.params for part in trained))

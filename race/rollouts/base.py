@@ -48,10 +48,10 @@ class Score(NamedTuple):
 class Play(NamedTuple):
     """The teams of one run that play a generation: the population, then the MARL team.
 
-    The MARL team explores, the population only where its actions are sampled
-    (`RaceConfig.population_actions`). The MARL team plays as often as ``n_marl`` says.
-    ``generation`` counts from 0, ``env_steps`` were made before; all steps go into the buffer, if
-    it has room at all.
+    A team that plays several episodes is there as often, the MARL team ``n_marl`` times. The MARL
+    team explores, the population only where its actions are sampled
+    (`RaceConfig.population_actions`). ``generation`` counts from 0, ``env_steps`` were made before;
+    steps go into the buffer, if it has room at all (`keepers` says whose).
     """
 
     config: Config
@@ -81,7 +81,10 @@ class Trial(NamedTuple):
 
 
 class Generation(NamedTuple):
-    """What the episodes of one generation came to, one of each acting team."""
+    """What the episodes of one generation came to, one of each acting team.
+
+    A team that plays several counts as so many.
+    """
 
     episode_return: NDArray[np.float64]  # [T]
     env_steps: int

@@ -27,7 +27,7 @@ def kind_of(config: Config) -> tuple[Any, ...]:
         config.env,
         config.algo,
         shape_of(config),
-        config.n_marl_teams,
+        (config.n_population_teams, config.n_marl_teams),
         config.race.population_actions,
         config.evaluation.episodes,
         config.facmac.replay_precision,
@@ -99,7 +99,7 @@ def _next(run: Run, state: RunState) -> _Piece:
 def _roll_out(
     runs: Sequence[Run], states: Sequence[RunState], chosen: Sequence[bool]
 ) -> list[Outcome]:
-    """Lines 3 to 6, every team plays one episode, and 9."""
+    """Lines 3 to 6, every team plays its episodes, and 9."""
     playing = [c for c, here in enumerate(chosen) if here]
     for c in playing:
         runs[c].clock.begin_generation()

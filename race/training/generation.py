@@ -20,6 +20,7 @@ from race.method.normalisation import Observed, observed_more
 from race.randomness import Purpose, host_seeds, root_key
 from race.rollouts.base import Generation, Play, Trial
 from race.rollouts.beginnings import Beginnings
+from race.training.fitness import Returns, averages, known_returns, means
 from race.training.keeping import keep_best
 from race.training.records import evaluation_row, generation_row
 from race.training.run import Run, stamped
@@ -50,15 +51,14 @@ def warm_up(run: Run, state: RunState) -> RunState:
 
 
 def to_play(run: Run, state: RunState) -> Play:
-    """Lines 3 to 6: the teams of a generation, each of which plays one episode."""
+    """Lines 3 to 6: the teams of a generation, each as often as it plays an episode."""
     progress, config = state.progress, run.config
     run.report("rollouts", progress, {})
     teams = run.algorithm.teams(state.algorithm, run.task.spec, run.statics["shape"])
     n_marl = config.n_marl_teams
     if progress.env_steps - progress.random_steps < config.race.evolution_from and n_marl:
         teams = teams.at(slice(teams.count - 1, None))  # of a population nobody plays yet
-    if n_marl:
-        teams = teams.last_again(n_marl)
+    teams = teams.again(config.race.fitness_episodes, n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
     judged_early = teams.count > n_marl and _surrogate_due(config, progress)
     steps = config.race.surrogate_steps if judged_early else None
@@ -78,9 +78,13 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     """The state with the results of the episodes; the generation's gradient steps are next."""
     progress, returns = state.progress, played.episode_return.tolist()
     n_teams = len(returns) - n_marl
-    fitness, of_marl = returns[:n_teams], returns[n_teams:]
+    fitness, of_marl = tuple(returns[:n_teams]), returns[n_teams:]
+    averaged: Returns = ()
     if played.beginnings is not None:
         fitness = _judged(run, state, played.beginnings)
+    elif fitness and averages(run.config):
+        averaged = _averaged(run, state, fitness)
+        fitness = means(averaged)
     progress = progress.but(
         env_steps_before=progress.env_steps,
         env_steps=progress.env_steps + played.env_steps,
@@ -88,7 +92,8 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
         stored=progress.stored + played.stored,
         gradient_steps_before=progress.gradient_steps,
         generation=progress.generation + 1,
-        fitness=tuple(fitness),
+        fitness=fitness,
+        returns=averaged,
         marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
         estimated=played.beginnings is not None,
         learning=True,
@@ -97,15 +102,34 @@ def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunStat
     return _observed(state._replace(progress=progress), played.observed)
 
 
-def _judged(run: Run, state: RunState, begun: Beginnings) -> list[float]:
+def _averaged(run: Run, state: RunState, returns: Sequence[float]) -> Returns:
+    """The returns by which the teams are judged that have played and not yet evolved.
+
+    Args:
+        run: the run.
+        state: its state.
+        returns: of this generation, all teams and then all again.
+    """
+    population = run.algorithm.population(state.algorithm)
+    assert population is not None
+    now, before = (np.asarray(of.id) for of in (population.record.now, population.record.played))
+    return known_returns(
+        np.reshape(returns, (-1, len(now))).T.tolist(),
+        now.tolist(),
+        before.tolist(),
+        state.progress.returns,
+        run.config.race.fitness_generations,
+    )
+
+
+def _judged(run: Run, state: RunState, begun: Beginnings) -> tuple[float, ...]:
     """Discounted returns of the population; the PeVFA guesses what lies behind a beginning.
 
     In the task's own units, whatever rewards are multiplied by for learning.
     """
     values = programs.expected(state.algorithm, begun.state, **run.statics, scaling=state.scaling)
     ahead = np.asarray(values, np.float64) / run.config.env.reward_scale
-    judged: list[float] = (begun.rewards + begun.weight * ahead).tolist()
-    return judged
+    return tuple((begun.rewards + begun.weight * ahead).tolist())
 
 
 def _observed(state: RunState, now: Observed | None) -> RunState:

@@ -49,6 +49,8 @@ def generation_row(
             row[f"operators/{name}_better_rate"] = rate
         if progress.fitness:
             row["teams"] = rows(record.played, progress.fitness)
+            for team, returns in zip(row["teams"], progress.returns, strict=False):
+                team["returns"] = list(returns)
     for name, total in losses.items():
         count = policy_steps if name in algorithm.policy_losses else steps
         row[f"loss/{name}"] = float(total) / count if count else None

@@ -42,6 +42,9 @@ class Progress:
     fitness: tuple[float, ...] = ()
     """Training returns of the population in the newest generation, or what it was judged by in
     place of them; empty without one."""
+    returns: tuple[tuple[float, ...], ...] = ()
+    """The returns whose means these are, of each team's episodes, the oldest first; empty where
+    settings ask for one episode of one generation."""
     marl_return: float | None = 0.0
     """Training return of the MARL team in the newest generation, the mean of its episodes; None
     where there is no such team."""
@@ -64,7 +67,8 @@ class Progress:
     def selected(self) -> str:
         """Of the MARL team and the champion, the one with the better training return.
 
-        A champion of which no whole episode is known is not selected.
+        A champion of which no whole episode is known is not selected. Where fitness is the mean of
+        several returns, it is what counts.
         """
         if self.marl_return is None:
             return "champion"

@@ -11,6 +11,7 @@ import numpy as np
 from race import ALGORITHM_VERSION, programs
 from race.algorithms import Algorithm
 from race.config.hyper import hyper_of
+from race.config.saved import tupled
 from race.config.settings import Config
 from race.errors import CheckpointError, DivergenceError
 from race.method.normalisation import Observed, nothing_observed
@@ -250,14 +251,15 @@ def progress_of(saved: Checkpoint) -> Progress:
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
     # Runs of before they were there lack these.
-    later = {"repeated", "estimated", "stored"}
+    later = {"repeated", "estimated", "stored", "returns"}
     if not isinstance(values, dict) or set(values) | later != names:
         raise CheckpointError(
             f"The checkpoint {saved.path} was not written by this version of race: its record of "
             "the run's progress differs. Use the version named in metadata.json."
         )
     values = {"stored": values["episodes"], **values}  # all of them went into the buffer then
-    return Progress(**{**values, "fitness": tuple(values["fitness"])})
+    listed = ("fitness", "returns")
+    return Progress(**{**values, **{name: tupled(values.get(name, ())) for name in listed}})
 
 
 def _filled(saved: Checkpoint, replay: Replay) -> Replay:

@@ -90,7 +90,8 @@ def _covered(progress: Progress, config: Config) -> float:
         return float(progress.env_steps)
     learned = progress.gradient_steps - progress.gradient_steps_before
     if config.discrete:
-        episodes = len(progress.fitness) + config.n_marl_teams
+        population = config.n_population_teams if progress.fitness else 0
+        episodes = population + config.n_marl_teams
         due = episodes * config.facmac.gradient_steps_per_episode
     else:
         due = made * config.learner.gradient_steps_per_env_step

@@ -59,6 +59,26 @@ def test_all_agents_of_a_team_act_through_its_head(state: Any, config: Config) -
     np.testing.assert_array_equal(tested["champion"], np.repeat(champion, N, axis=0))
 
 
+def test_a_head_that_learns_climbs_for_all_its_agents(
+    state: Any, config: Config, tiny_config: Callable[..., Config]
+) -> None:
+    """Its step is the sum of those that agents with heads of their own would take."""
+    rate = 1e3  # gradients are small beside heads, and would be lost in rounding
+    learning, apart = (
+        dataclasses.replace(one, race=dataclasses.replace(one.race, head_learning_rate=rate))
+        for one in (config, tiny_facmac(tiny_config))
+    )
+    repeated = with_heads(start(apart), jnp.repeat(state.heads, N, axis=1))
+    batch = laid_out(random_batch(), junk_seed=1)
+    one = stepper(learning, race, fixed=False)(state, batch).after.heads - state.heads
+    other = stepper(apart, race, fixed=False)(repeated, batch).after.heads - repeated.heads
+    assert one.shape == (P, 1, H + 1, A)
+    moved = np.flatnonzero(np.abs(one).max(axis=(1, 2, 3)))
+    assert len(moved) == 1
+    summed = jnp.sum(other, axis=1, keepdims=True)
+    np.testing.assert_allclose(one, summed, rtol=1e-2, atol=1e-3 * np.abs(summed).max())
+
+
 def test_gradient_steps_are_those_of_teams_whose_agents_have_equal_heads(
     state: Any, config: Config, tiny_config: Callable[..., Config]
 ) -> None:

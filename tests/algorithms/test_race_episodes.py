@@ -58,13 +58,17 @@ from race.config.settings import Config
 CHOSEN = {"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"}
 
 
+# Gradients are small here beside the heads, which a step of 1e3 of them does not lose in rounding.
 @pytest.fixture(
     scope="module",
-    params=[{"layer_norm": True}, {}, CHOSEN],
-    ids=["normalised", "plain", "other choices"],
+    params=[({"layer_norm": True}, 0.0), ({}, 0.0), (CHOSEN, 0.0), ({}, 1e3)],
+    ids=["normalised", "plain", "other choices", "heads-learn"],
 )
 def config(request: Any, tiny_config: Callable[..., Config]) -> Config:
-    return tiny_facmac(tiny_config, **request.param)
+    choices, rate = request.param
+    tiny = tiny_facmac(tiny_config, **choices)
+    race = dataclasses.replace(tiny.race, head_learning_rate=rate)
+    return dataclasses.replace(tiny, race=race)
 
 
 class Explained(NamedTuple):
@@ -241,10 +245,29 @@ def test_nothing_is_learned_from_the_dead(explained: Explained) -> None:
     assert (gradient[2:] != 0).any(axis=1).all()
 
 
-def test_the_population_is_left_alone_and_targets_become_copies(explained: Explained) -> None:
+def test_the_population_is_left_alone(explained: Explained, config: Config) -> None:
+    """But for the team of Eq. (2), where it climbs its second term by its actions."""
+    x, rate = explained, config.race.head_learning_rate
+    new, old = np.asarray(x.after.heads), np.asarray(x.before.heads)
+    (place,) = (p for p, head in enumerate(float64(old)) if np.array_equal(head, x.team))
+    others = np.arange(len(old)) != place
+    np.testing.assert_array_equal(new[others], old[others])
+    if not rate:
+        np.testing.assert_array_equal(new[place], old[place])
+        return
+    encoder, pevfa = params(x.before.policies).encoder, float64(x.after.critics.pevfa.params)
+
+    def value(head: np.ndarray) -> float:
+        samples, critic = x.team_samples, pevfa.critic
+        return policy_values(encoder, head, samples, x.episodes, critic, pevfa, seen=x.team)
+
+    assert_gradients_equal((new[place] - x.team) / rate, numeric_gradient(value, x.team))
+
+
+def test_targets_become_copies(explained: Explained) -> None:
     before, after = explained.before, explained.after
-    assert jnp.array_equal(after.heads, before.heads)
     assert TARGET_EVERY == 2  # and this was the step of number 1
+    assert not jnp.array_equal(before.target.head, after.target.head)
     trained = (*after.policies[:2], *after.critics[:2])
     for target, online in zip(after.target, trained, strict=True):
         for t, o in zip(*map(jax.tree.leaves, (target, online.params)), strict=True):

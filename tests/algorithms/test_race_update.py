@@ -276,8 +276,15 @@ def drawn_team(before: Any, pevfa_loss_seen: float, f: Frozen) -> np.ndarray:
 
 @pytest.fixture(
     scope="module",
-    params=[*((base, True) for base in ("matd3", "maddpg", "facmac")), ("matd3", False)],
-    ids=lambda param: f"{param[0]}-{'normalised' if param[1] else 'plain'}",
+    params=[
+        *((base, True, 0.0) for base in ("matd3", "maddpg", "facmac")),
+        ("matd3", False, 0.0),
+        ("matd3", True, 0.5),
+        ("facmac", True, 0.5),
+    ],
+    ids=lambda param: "-".join(
+        [param[0], "normalised" if param[1] else "plain", *["heads-learn"] * (param[2] > 0)]
+    ),
 )
 def stepped(
     request: Any,
@@ -286,8 +293,10 @@ def stepped(
     batch_of: Callable[..., Any],
     compiled: Callable[..., Any],
 ) -> Step:
-    base, layer_norm = request.param
-    config = tiny_config("race", base, learner={"layer_norm": layer_norm})
+    base, layer_norm, rate = request.param
+    config = tiny_config(
+        "race", base, learner={"layer_norm": layer_norm}, race={"head_learning_rate": rate}
+    )
     before = separate(race.init(jax.random.key(11), tiny_spec, shape_of(config), hyper_of(config)))
     batch = batch_of(tiny_spec, B)
     after, critic_losses, policy_losses = compiled(race, "update", tiny_spec, config)(
@@ -404,9 +413,27 @@ def test_mine_climbs_the_plain_bound_of_equation_3(stepped: Step) -> None:
 
 
 def test_population_and_bookkeeping_are_left_alone(stepped: Step) -> None:
-    both = stepped.after.population, stepped.before.population
-    for new, old in zip(*map(jax.tree.leaves, both), strict=True):
-        assert jnp.array_equal(new, old)
+    """But for the heads of the team of Eq. (2), where they climb its second term."""
+    rate, f, before = stepped.config.race.head_learning_rate, stepped.frozen, stepped.before
+    new, old = np.asarray(stepped.after.heads), np.asarray(before.heads)
+    (place,) = (p for p, head in enumerate(float64(old)) if np.array_equal(head, f.team))
+    encoder, pevfa = params(before.policies).encoder, params(stepped.after.critics).pevfa
+
+    def value(head: np.ndarray) -> float:
+        """Through its actions; the PeVFA goes on seeing the team that was drawn."""
+        actions = [pi(encoder, head, f.spec, s) for s in f.batch.state]
+        pairs = zip(f.batch.state, actions, strict=True)
+        return float(np.mean([q_theta(pevfa, 0, f.spec, s, u, f.team) for s, u in pairs]))
+
+    if rate:
+        uphill = numeric_gradient(value, f.team)
+        assert_gradients_equal((new[place] - f.team) / rate, uphill)
+        assert np.array_equal(new[place] != old[place], uphill != 0)
+    kept = np.arange(len(old)) != place if rate else slice(None)
+    np.testing.assert_array_equal(new[kept], old[kept])
+    both = with_heads(stepped.after, old).population, before.population
+    for after, was in zip(*map(jax.tree.leaves, both), strict=True):
+        assert jnp.array_equal(after, was)
 
 
 def test_every_network_steps_along_its_gradient(stepped: Step) -> None:

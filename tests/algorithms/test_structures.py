@@ -302,7 +302,6 @@ def test_one_encoder_learns_from_all_agents(
 @pytest.mark.parametrize("marl_among_teams", [False, True])
 @pytest.mark.parametrize("team_draw", ["once", "each"])
 def test_teams_of_a_gradient_step(
-    tiny_spec: EnvSpec,
     tiny_config: Callable[..., Config],
     team_draw: str,
     marl_among_teams: bool,
@@ -311,8 +310,11 @@ def test_teams_of_a_gradient_step(
     shape = shape_of(tiny_config("race", "matd3", race=choice))
     heads = jnp.arange(5.0)[:, None, None, None] * jnp.ones((5, 2, 5, 2))
     marl_head = jnp.full((2, 5, 2), 5.0)
-    draw = jax.jit(jax.vmap(lambda key: draw_teams(heads, marl_head, key, tiny_spec, shape)))
-    first, second = (np.asarray(team)[:, 0, 0, 0] for team in draw(KEYS))
+    draw = jax.jit(jax.vmap(lambda key: draw_teams(heads, marl_head, key, shape)))
+    drawn = draw(KEYS)
+    first, second = (np.asarray(team.heads)[:, 0, 0, 0] for team in drawn)
+    for team, found in zip(drawn, (first, second), strict=True):
+        np.testing.assert_array_equal(team.place, found)
     n = 5 + marl_among_teams
     for found in (first, second):
         for team in range(n):

@@ -40,6 +40,7 @@ OTHER: dict[str, Any] = {
     **{"own_share": 0.5, "replayed": "better"},
     **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
     **{"population_actions": "sampled", "team_heads": "shared"},
+    "head_learning_rate": 1e-3,
 }
 SETTINGS = [
     (group, field.name)
@@ -72,6 +73,10 @@ def read_on_host(config: Config, group: str, name: str) -> bool:
     if group == "race":
         if name == "population_actions":
             return config.has_population and config.discrete
+        if name == "fitness_episodes":
+            return config.has_population
+        if name == "fitness_generations":
+            return config.has_population and config.race.evolution not in ("cem", "es")
         beside = config.has_population and config.has_marl
         return beside and (
             name in ("marl_episodes", "evolution_from", "replayed")

@@ -263,6 +263,35 @@ def test_beginnings_of_episodes_may_judge_the_population(
     check_resumption(tmp_path, config)
 
 
+@pytest.mark.parametrize(
+    ("base", "task"),
+    [
+        ("matd3", "probe/target"),
+        pytest.param("facmac", "probe/lives", marks=pytest.mark.slow),
+    ],
+)
+def test_heads_of_the_population_may_learn(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, base: str, task: str
+) -> None:
+    monkeypatch.setattr(learning, "CHUNK", 7)
+    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
+    config = small("race", base, task, head_learning_rate=0.1)
+    progress = run(tmp_path / "whole", config)
+    check_rows(tmp_path / "whole", config, progress)
+    check_resumption(tmp_path, config)
+    check_teams(tmp_path / "whole", config)
+    newest = checkpoints.newest(tmp_path / "whole" / "checkpoints")
+    assert newest is not None
+    arrays = checkpoints.load(newest).arrays
+    heads, elite, champion = (
+        np.asarray(arrays[f"['algorithm'].population.{name}"])
+        for name in ("teams.heads", "elite", "champion.heads")
+    )
+    # The elite has learned since it was measured, and the champion has not.
+    assert not np.array_equal(heads[elite], champion)
+    np.testing.assert_allclose(heads[elite], champion, atol=1.0)
+
+
 def test_an_estimate_selects_nobody() -> None:
     returned = Progress(fitness=(9.0, 11.0), marl_return=10.0)
     assert returned.selected == "champion"
