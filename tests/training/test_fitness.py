@@ -122,7 +122,8 @@ def test_a_team_that_did_not_change_is_judged_by_several_generations(
 ) -> None:
     most, episodes = 3, race.get("fitness_episodes", 1)
     config = small(algo, base, task, fitness_generations=most, **race)
-    config = dataclasses.replace(config, env_steps=90 * episodes)
+    steps = 300 if config.discrete else 90  # an episode has several there, and one here
+    config = dataclasses.replace(config, env_steps=steps * episodes)
     progress = run(tmp_path / "whole", config)
     generations = [row for row in rows(tmp_path / "whole", "generation") if "teams" in row]
     played = [found for found in returned if len(found) == config.n_teams]
