@@ -141,7 +141,8 @@ def test_a_team_that_did_not_change_is_judged_by_several_generations(
         known = {team["id"]: team["returns"] for team in row["teams"]}
         fitness = [team["fitness"] for team in row["teams"]]
         assert row["population/fitness_mean"] == pytest.approx(np.mean(fitness))
-    assert lengths == {1, 2, 3}
+    # The run that begins to evolve late is too short for anybody to live through three.
+    assert lengths == ({1, 2} if "evolution_from" in race else {1, 2, 3})
     assert progress.returns == tuple(tuple(team["returns"]) for team in generations[-1]["teams"])
     # Who lives on as the elite, and is the champion, is the fittest by these means.
     for row, following in itertools.pairwise(generations):
