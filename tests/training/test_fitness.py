@@ -122,7 +122,8 @@ def test_a_team_that_did_not_change_is_judged_by_several_generations(
 ) -> None:
     most, episodes = 3, race.get("fitness_episodes", 1)
     config = small(algo, base, task, fitness_generations=most, **race)
-    config = dataclasses.replace(config, env_steps=90 * episodes)
+    steps = 300 if config.discrete else 90  # an episode has several there, and one here
+    config = dataclasses.replace(config, env_steps=steps * episodes)
     progress = run(tmp_path / "whole", config)
     generations = [row for row in rows(tmp_path / "whole", "generation") if "teams" in row]
     played = [found for found in returned if len(found) == config.n_teams]
@@ -140,7 +141,8 @@ def test_a_team_that_did_not_change_is_judged_by_several_generations(
         known = {team["id"]: team["returns"] for team in row["teams"]}
         fitness = [team["fitness"] for team in row["teams"]]
         assert row["population/fitness_mean"] == pytest.approx(np.mean(fitness))
-    assert lengths == {1, 2, 3}
+    # The run that begins to evolve late is too short for anybody to live through three.
+    assert lengths == ({1, 2} if "evolution_from" in race else {1, 2, 3})
     assert progress.returns == tuple(tuple(team["returns"]) for team in generations[-1]["teams"])
     # Who lives on as the elite, and is the champion, is the fittest by these means.
     for row, following in itertools.pairwise(generations):
