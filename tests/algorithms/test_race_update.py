@@ -278,9 +278,8 @@ def drawn_team(before: Any, pevfa_loss_seen: float, f: Frozen) -> np.ndarray:
     scope="module",
     params=[
         *((base, True, 0.0) for base in ("matd3", "maddpg", "facmac")),
-        ("matd3", False, 0.0),
-        ("matd3", True, 0.5),
-        ("facmac", True, 0.5),
+        ("matd3", False, 0.5),
+        pytest.param(("facmac", True, 0.5), marks=pytest.mark.slow),
     ],
     ids=lambda param: "-".join(
         [param[0], "normalised" if param[1] else "plain", *["heads-learn"] * (param[2] > 0)]

@@ -1,5 +1,6 @@
 """Minibatches of which a share is the MARL team's own experience."""
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -7,6 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from race import programs
+from race.algorithms import algorithm_of
+from race.config.hyper import hyper_of
+from race.config.presets import resolve
+from race.config.settings import Config, RaceConfig
+from race.config.shape import shape_of
+from race.programs import cohort
 from race.replay.buffer import (
     Replay,
     columns,
@@ -17,11 +25,13 @@ from race.replay.buffer import (
     sources_of,
     with_columns,
 )
+from race.rollouts.episodes import empty_episode
 from race.rollouts.transitions import empty_transition, store
-from race.types import EnvSpec, Transition
+from race.types import DiscreteSpec, EnvSpec, Transition
 
 CAPACITY = 12
 SPEC = EnvSpec("t", 2, ((0,), (1,)), ((0,), (1,)), (-1.0, -1.0), (1.0, 1.0), 5)
+DISCRETE = DiscreteSpec("d", n_agents=2, obs_size=3, state_size=4, n_actions=5, episode_limit=6)
 _sample = jax.jit(sample, static_argnames="batch_size")
 _sources_of = jax.jit(sources_of)
 _distinct_places = jax.jit(distinct_places, static_argnames="batch_size")
@@ -103,8 +113,6 @@ def test_without_the_setting_minibatches_are_what_they_were() -> None:
 
 
 def test_pieces_of_any_length_keep_whose_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    from race import programs
-
     monkeypatch.setattr(programs, "INSERT_ROWS", 4)
     replay = init_replay(empty_transition(SPEC), 20, owned=True)
     own = np.arange(11) % 4 == 1
@@ -135,6 +143,48 @@ def test_every_episode_of_a_kind_is_as_likely() -> None:
         counts[places] += 1
     p = np.where(np.arange(10) < 4, 3 / 4, 3 / 6)
     assert (np.abs(counts - draws * p) <= 5 * np.sqrt(draws * p * (1 - p))).all()
+
+
+def told(state: Any, batch: Any, *_: Any) -> Any:
+    """In the place of a gradient step: how much of its minibatch is below 4."""
+    return state, {"own": jnp.mean(batch.reward < 4)}, {}
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+@pytest.mark.parametrize("together", [False, True])
+def test_gradient_steps_get_the_share_of_the_configuration(share: float, together: bool) -> None:
+    config = resolve(Config("t", race=RaceConfig(own_share=share)), discrete=False)
+    config = dataclasses.replace(config, learner=dataclasses.replace(config.learner, batch_size=8))
+    algorithm = algorithm_of(config)._replace(update=told, critic_losses=("own",), policy_losses=())
+    shape, hyper, steps = shape_of(config), hyper_of(config), 3
+    replay = filled([i < 4 for i in range(CAPACITY)])
+    key, first = jax.random.key(2), np.int32(5)
+    if together:
+        drawn = cohort.minibatches(replay, key, first, hyper=hyper, room=steps, shape=shape)
+        assert drawn.reward.shape == (steps, 8)
+        np.testing.assert_array_equal(jnp.mean(drawn.reward < 4, axis=1), share)
+        return
+    statics: Any = {"algorithm": algorithm, "spec": SPEC, "shape": shape, "hyper": hyper}
+    zeros = programs.empty_losses(algorithm)
+    begun = jnp.zeros(())
+    _, sums = programs.learn(begun, zeros, replay, key, first, np.int32(steps), **statics)
+    assert sums["own"] == steps * share
+
+
+def test_episodes_of_gradient_steps_too() -> None:
+    config = Config("t", algo="race", race=RaceConfig(own_share=0.5))
+    config = resolve(config, discrete=True)
+    config = dataclasses.replace(config, facmac=dataclasses.replace(config.facmac, batch_size=6))
+    replay = init_replay(empty_episode(DISCRETE, "float32"), CAPACITY, owned=True)
+    empty = empty_episode(DISCRETE, "float32", CAPACITY)
+    episodes = empty._replace(length=np.arange(CAPACITY, dtype=np.int32) + 1)
+    replay = insert(replay, episodes, jnp.int32(CAPACITY), jnp.arange(CAPACITY) < 4)
+    key, shape, hyper = jax.random.key(2), shape_of(config), hyper_of(config)
+    places, lengths = programs.draw(
+        replay, key, np.int32(7), np.int32(2), hyper=hyper, room=2, shape=shape
+    )
+    np.testing.assert_array_equal(lengths, places + 1)
+    np.testing.assert_array_equal(jnp.sum(places < 4, axis=1), 3)
 
 
 def test_columns_go_to_disk_and_back() -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -48,7 +47,11 @@ def test_of_the_population_the_better_half_is_kept(
 
 
 @pytest.mark.parametrize(
-    ("algo", "base", "task"), [("merl", "matd3", "probe/target"), ("race", "facmac", "probe/lives")]
+    ("algo", "base", "task"),
+    [
+        ("merl", "matd3", "probe/target"),
+        pytest.param("race", "facmac", "probe/lives", marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_replayed_over_a_whole_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, algo: str, base: str, task: str
@@ -79,17 +82,6 @@ def test_what_is_replayed_over_a_whole_run(
         # Every probe episode has a step at least; none of the MARL team's is lost.
         assert len(made) <= own.sum() < replay.inserted - progress.random_steps
     check_resumption(tmp_path, config)
-
-
-def test_the_share_decides_what_is_learned(tmp_path: Path) -> None:
-    """The same run but for the share: the first generation plays alike, what it learns differs."""
-    found: list[dict[str, Any]] = []
-    for share in (0.0, 1.0):
-        config = small("race", "matd3", "probe/target", own_share=share)
-        run(tmp_path / str(share), config)
-        found.append(rows(tmp_path / str(share), "generation")[0])
-    assert found[0]["marl/return"] == found[1]["marl/return"]
-    assert found[0]["loss/critic"] != found[1]["loss/critic"]
 
 
 def test_episodes_are_learned_from_when_a_minibatch_of_them_is_stored() -> None:
