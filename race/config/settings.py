@@ -237,8 +237,8 @@ class RaceConfig:
     """Share of a minibatch that is the MARL team's own experience; the rest is others', random
     steps among them. None: what the replay buffer holds, about a sixth with five teams."""
     replayed: Replayed = "all"
-    """Whose experience of a generation goes into the replay buffer: that of all teams, or, of the
-    population, of the better ones alone, which returned no less than its median."""
+    """Which episodes of a generation go into the replay buffer: all, or, of the population's, the
+    better ones alone, which returned no less than their median. The MARL team's always do."""
     fitness_episodes: int = 1
     """Episodes of each team of the population in a generation; their mean return is its fitness."""
     fitness_generations: int = 1

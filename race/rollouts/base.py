@@ -168,7 +168,7 @@ class Rollouts(Protocol):
 def keepers(episode_return: Float[Any, "T"], play: Play) -> NDArray[np.bool_]:
     """Whose episodes go into the buffer, [T]: the MARL team's, and those of the population.
 
-    Of the population all, or the better half: those that returned no less than its median.
+    Of the population's all, or the better half: those that returned no less than their median.
     """
     kept = np.ones(play.teams.count, bool)
     population = np.asarray(episode_return)[: play.teams.count - play.n_marl]

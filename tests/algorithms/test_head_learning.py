@@ -88,7 +88,10 @@ def test_heads_wait_for_the_policy_delay(world: World) -> None:
     assert len(world.moved(after)) == 1
 
 
-@pytest.mark.parametrize(("team_draw", "marl_among_teams"), [("once", False), ("each", True)])
+@pytest.mark.parametrize(
+    ("team_draw", "marl_among_teams"),
+    [("once", False), pytest.param("each", True, marks=pytest.mark.slow)],
+)
 def test_the_team_of_equation_2_moves_and_no_other(
     world_of: Callable[..., World], team_draw: str, marl_among_teams: bool
 ) -> None:

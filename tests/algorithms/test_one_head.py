@@ -59,6 +59,7 @@ def test_all_agents_of_a_team_act_through_its_head(state: Any, config: Config) -
     np.testing.assert_array_equal(tested["champion"], np.repeat(champion, N, axis=0))
 
 
+@pytest.mark.slow
 def test_a_head_that_learns_climbs_for_all_its_agents(
     state: Any, config: Config, tiny_config: Callable[..., Config]
 ) -> None:

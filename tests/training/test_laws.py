@@ -266,7 +266,7 @@ def test_beginnings_of_episodes_may_judge_the_population(
 @pytest.mark.parametrize(
     ("base", "task"),
     [
-        ("matd3", "probe/target"),
+        pytest.param("matd3", "probe/target", marks=pytest.mark.slow),
         pytest.param("facmac", "probe/lives", marks=pytest.mark.slow),
     ],
 )

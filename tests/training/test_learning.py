@@ -160,7 +160,7 @@ def test_agents_of_unequal_size_learn_functions_of_what_they_see(
     assert np.abs(learned.q(states, np.asarray(data.action[:500])) - true).mean() < 0.2
 
 
-@pytest.mark.parametrize(("algo", "base"), methods("maddpg"))
+@pytest.mark.parametrize(("algo", "base"), methods("maddpg", "facmac"))
 def test_value_flows_back_discounted(train: Train, algo: str, base: str) -> None:
     learned, data = train(algo, base, "probe/chain", 3000)
     states, actions = np.asarray(data.state[:400]), np.asarray(data.action[:400])
