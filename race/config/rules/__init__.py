@@ -1,4 +1,7 @@
-"""What the values of settings must be, for each part of a configuration."""
+"""What the values of settings must be, for each part of a configuration.
+
+`race.config.checks` refuses what breaks one. What has no effect is in `race.config.effects`.
+"""
 
 from typing import Any
 
