@@ -3,8 +3,7 @@
 import math
 from collections.abc import Iterable
 
-from race.config import numbers
-from race.config.rules import LARGEST_LAYER, Rule, environments, learners, population
+from race.config.rules import LARGEST_LAYER, Rule, environments, learners, numbers, population
 from race.config.settings import Config, EnvConfig
 from race.errors import ConfigError
 

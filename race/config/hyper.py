@@ -99,7 +99,7 @@ def hyper_of(config: Config) -> Hyper:
     idle = set()
     if config.whole_teams:
         idle |= {"vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"}
-        idle |= {"head_learning_rate"}
+        idle.add("head_learning_rate")
     if not config.has_marl:
         idle |= {"injection_probability", "own_share", *_OF_GRADIENTS}
     if config.has_population:

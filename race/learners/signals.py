@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from race.config.shape import Shape
 from race.learners.moments import Moments
 from race.method.equations import mutual_information_signal, mutual_information_signal_across
-from race.networks.dense import Mine
+from race.networks.dense import Mine, encode_state
 
 GROUP = 32
 """Steps among which MINE's pairs are made."""
@@ -55,8 +55,7 @@ def _against_other_steps(
         return jnp.concatenate([flat, missing])[deal].reshape(groups, GROUP, *flat.shape[1:])
 
     state, embedding, count = dealt(moments.state), dealt(z), dealt(counted)
-    x = jax.nn.leaky_relu(mine.state_hidden(state.reshape(groups * GROUP, -1)))
-    x = jax.nn.leaky_relu(mine.state_out(x)).reshape(groups, GROUP, -1)
+    x = encode_state(mine, state.reshape(groups * GROUP, -1)).reshape(groups, GROUP, -1)
     y = mine.embedding(embedding.reshape(groups * GROUP * agents, -1))
     y = y.reshape(groups, GROUP, agents, -1)
     scores = jnp.einsum("gtm,gknm->gntk", x, y)
@@ -82,8 +81,7 @@ def _against_other_episodes(
 ) -> Float[Array, "B"]:
     """The embeddings of all agents of the other episodes at the same time are the negatives."""
     agents, samples = z.shape[2], z.shape[0] * z.shape[1]
-    x = jax.nn.leaky_relu(mine.state_hidden(moments.state.reshape(samples, -1)))
-    x = jax.nn.leaky_relu(mine.state_out(x))
+    x = encode_state(mine, moments.state.reshape(samples, -1))
     y = mine.embedding(z.reshape(samples * agents, -1)).reshape(samples, agents, -1)
     places = of_each_time(moments.first, moments.real > 0, episodes)
 

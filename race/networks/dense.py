@@ -223,6 +223,11 @@ def init_one_mine(key: PRNGKeyArray, state_size: int, embedding_size: int, size:
     )
 
 
+def encode_state(mine: Mine, state: Float[Array, "*b S"]) -> Float[Array, "*b M"]:
+    """What `mine_scores` compares an embedding's encoding with (Appendix A.1)."""
+    return jax.nn.leaky_relu(mine.state_out(jax.nn.leaky_relu(mine.state_hidden(state))))
+
+
 def mine_scores(
     mine: Mine, state: Float[Array, "B S"], z: Float[Array, "N B H"]
 ) -> Float[Array, "N B B"]:
@@ -236,8 +241,7 @@ def mine_scores(
     # One copy per network, as in the critics.
     count = mine.state_out.bias.shape[0]
     x = jnp.broadcast_to(state, (count, *state.shape))
-    x = jax.nn.leaky_relu(mine.state_hidden(x))
-    x = jax.nn.leaky_relu(mine.state_out(x))
+    x = encode_state(mine, x)
     y = mine.embedding(z.reshape(count, -1, z.shape[2])).reshape(*z.shape[:2], -1)
     x = jnp.broadcast_to(x, (z.shape[0], *x.shape[1:]))
     return jnp.einsum("ntm,nkm->ntk", x, y)

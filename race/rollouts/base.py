@@ -64,6 +64,11 @@ class Play(NamedTuple):
     """Steps after which the population stops, which is judged by them; None: it plays to the end.
     The MARL team does so in any case."""
 
+    @property
+    def n_population(self) -> int:
+        """Episodes of the population; the first of ``teams`` play them."""
+        return self.teams.count - self.n_marl
+
 
 class Trial(NamedTuple):
     """Teams that one run tests, over the same encoders, each on all the seeds."""
@@ -91,7 +96,7 @@ class Generation(NamedTuple):
     repeated: int
     """Episodes that were begun anew because an environment failed."""
     stored: int
-    """Episodes that went into the buffer, or a part of them did."""
+    """Episodes that went into the buffer, or would if it had room at all."""
     observed: Observed | None = None
     """What all teams saw, where observations are normalised."""
     beginnings: Beginnings | None = None
@@ -171,7 +176,7 @@ def keepers(episode_return: Float[Any, "T"], play: Play) -> NDArray[np.bool_]:
     Of the population's all, or the better half: those that returned no less than their median.
     """
     kept = np.ones(play.teams.count, bool)
-    population = np.asarray(episode_return)[: play.teams.count - play.n_marl]
+    population = np.asarray(episode_return)[: play.n_population]
     if play.config.race.replayed == "better" and population.size:
         kept[: population.size] = population >= np.median(population)
     return kept

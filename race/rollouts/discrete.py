@@ -221,7 +221,7 @@ def _with_episodes(
     if not kept.all():  # the first ones are written
         teams = np.argsort(~kept, kind="stable")
         episodes = jax.tree.map(lambda column: column[teams], episodes)
-    own = None if replay.own is None else teams >= play.teams.count - play.n_marl
+    own = None if replay.own is None else teams >= play.n_population
     return programs.store(replay, episodes, np.int32(kept.sum()), own)
 
 
@@ -233,7 +233,7 @@ def _exploration(play: Play) -> Exploration | None:
     share = epsilon(
         play.env_steps, facmac.epsilon_start, facmac.epsilon_finish, facmac.epsilon_steps
     )
-    marl = jnp.arange(teams) >= teams - play.n_marl
+    marl = jnp.arange(teams) >= play.n_population
     return Exploration(
         jnp.ones(teams, bool) if sampled else marl,
         jnp.where(marl, jnp.float32(share), jnp.float32(0)),

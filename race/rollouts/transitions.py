@@ -135,9 +135,8 @@ class TransitionRollouts(Closing):
             observed = seen_by(played, play.config)
             begun = None
             if play.beginnings is not None:
-                population = play.teams.count - play.n_marl
                 discount = play.config.learner.discount
-                begun = beginnings(played, population, play.beginnings, discount)
+                begun = beginnings(played, play.n_population, play.beginnings, discount)
             made = Generation(played.episode_return, steps, repeated, stored, observed, begun)
             results.append((replay, made))
         return results
@@ -246,7 +245,7 @@ def _longest(play: Play, limit: int) -> NDArray[np.int64]:
     """Of each team, how many steps it plays at most."""
     steps = np.full(play.teams.count, limit)
     if play.beginnings is not None:
-        steps[: play.teams.count - play.n_marl] = play.beginnings
+        steps[: play.n_population] = play.beginnings
     return steps
 
 
@@ -277,7 +276,7 @@ def _with_steps(replay: Replay, played: Rollout, kept: NDArray[np.bool_], play: 
     if not kept.all():
         rows = np.flatnonzero(kept[played.team])
     steps = Transition(*(column[rows] for column in played.transitions))
-    own = played.team[rows] >= play.teams.count - play.n_marl
+    own = played.team[rows] >= play.n_population
     return store(replay, scaled(steps, play.config.env.reward_scale), own)
 
 
@@ -289,7 +288,7 @@ def store(replay: Replay, transitions: Transition, own: NDArray[np.bool_] | None
     size = min(programs.INSERT_ROWS, replay.capacity)
     if replay.own is None:
         own = None
-    elif own is None:
+    elif own is None:  # said, for one program to serve all
         own = np.zeros(len(transitions.reward), bool)
     for first in range(0, len(transitions.reward), size):
         piece = Transition(*(column[first : first + size] for column in transitions))

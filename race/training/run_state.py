@@ -30,7 +30,7 @@ class Progress:
     episodes: int = 0
     """Episodes of all teams, without those of the warm-up."""
     stored: int = 0
-    """Those of them that went into the replay buffer."""
+    """Those of them that went into the replay buffer, or would if anything were learned."""
     generation: int = 0
     """Generations begun."""
     learning: bool = False

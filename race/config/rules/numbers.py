@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+from race.config.rules import Rule
 from race.config.settings import Config
 
 MOST = 2**31 - 1
@@ -12,7 +13,7 @@ MOST_NOISE = 1000.0
 """Standard deviations of noise, in units of half an action's range, which clips what is beyond."""
 
 
-def rules(config: Config) -> Iterator[tuple[bool, str, Any, str]]:
+def rules(config: Config) -> Iterator[Rule]:
     """For each number whether programs can hold it, its name and value, and what it must be."""
     for name, value in _leaves(config, ""):
         if type(value) is int:
