@@ -142,6 +142,7 @@ def test_every_setting_is_in_a_shape_or_a_hyper_or_known_to_be_the_hosts() -> No
         "population_actions",
         "evolution_from",
         "replayed",
+        "learn_after",
         "fitness_episodes",
         "fitness_generations",
         "surrogate_probability",

@@ -32,6 +32,7 @@ _SHARED_ENCODERS = (
 )
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
+    "learn_after",
 )
 _DRAWN_ANEW = ("cem", "es")
 _OF_EVOLUTIONS = {

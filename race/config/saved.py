@@ -77,6 +77,7 @@ _BEFORE: dict[str, Any] = {
     "evolution_from": 0,
     "own_share": None,
     "replayed": "all",
+    "learn_after": "generation",
     "random_steps_owed": False,
     "compute": ComputeConfig(),
     "keep_best": 0,

@@ -27,6 +27,7 @@ MineNegatives = Literal["steps", "episodes"]
 PopulationActions = Literal["greedy", "sampled"]
 TeamHeads = Literal["agent", "shared"]
 Replayed = Literal["all", "better"]
+LearnAfter = Literal["generation", "episode"]
 EVOLUTIONS = ("ga", "cem", "es")
 TeamName = Literal["marl", "champion", "selected"]
 TeamReward = Literal["mean", "sum"]
@@ -239,6 +240,9 @@ class RaceConfig:
     replayed: Replayed = "all"
     """Which episodes of a generation go into the replay buffer: all, or, of the population's, the
     better ones alone, which returned no less than their median. The MARL team's always do."""
+    learn_after: LearnAfter = "generation"
+    """When gradient steps are made: in one block after all episodes of a generation, or, after
+    each episode, those that it owes; the teams then play one after the other."""
     fitness_episodes: int = 1
     """Episodes of each team of the population in a generation; their mean return is its fitness."""
     fitness_generations: int = 1
@@ -397,7 +401,7 @@ class Config:
 
     @property
     def n_marl_teams(self) -> int:
-        """Episodes of the MARL team in a generation, all at once."""
+        """Episodes of the MARL team in a generation."""
         if not self.has_marl:
             return 0
         return self.race.marl_episodes if self.has_population else 1
@@ -409,13 +413,18 @@ class Config:
 
     @property
     def n_population_teams(self) -> int:
-        """Episodes of the population in a generation, all at once."""
+        """Episodes of the population in a generation."""
         return self.race.population_size * self.race.fitness_episodes * self.has_population
 
     @property
     def n_teams(self) -> int:
-        """Teams that act at once: the population and the MARL team, as often as they play."""
+        """Teams of a generation: the population and the MARL team, as often as they play."""
         return self.n_population_teams + self.n_marl_teams
+
+    @property
+    def in_turns(self) -> bool:
+        """Whether the teams of a generation play one after the other, and not all at once."""
+        return self.has_population and self.race.learn_after == "episode"
 
     @property
     def method(self) -> str:

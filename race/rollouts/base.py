@@ -46,7 +46,9 @@ class Score(NamedTuple):
 
 
 class Play(NamedTuple):
-    """The teams of one run that play a generation: the population, then the MARL team.
+    """The teams of one run that play at once: the population, then the MARL team.
+
+    They are those of a generation, or one of them where they take turns.
 
     A team that plays several episodes is there as often, the MARL team ``n_marl`` times. The MARL
     team explores, the population only where its actions are sampled
@@ -63,6 +65,14 @@ class Play(NamedTuple):
     beginnings: int | None = None
     """Steps after which the population stops, which is judged by them; None: it plays to the end.
     The MARL team does so in any case."""
+    turn: int = 0
+    turns: int = 1
+    """Which part of at most how many it is, where the teams of a generation take turns."""
+
+    @property
+    def number(self) -> int:
+        """A counter of the parts that the run has played: the chance of each is its own."""
+        return self.generation * self.turns + self.turn
 
     @property
     def n_population(self) -> int:

@@ -208,7 +208,7 @@ def _small(seeds: NDArray[np.int64]) -> NDArray[np.uint32]:
 
 def _seeds(play: Play) -> NDArray[np.uint32]:
     seed, count = play.config.seed, play.teams.count
-    return _small(host_seeds(seed, Purpose.ROLLOUT, play.generation, count))
+    return _small(host_seeds(seed, Purpose.ROLLOUT, play.number, count))
 
 
 def _with_episodes(
@@ -237,5 +237,5 @@ def _exploration(play: Play) -> Exploration | None:
     return Exploration(
         jnp.ones(teams, bool) if sampled else marl,
         jnp.where(marl, jnp.float32(share), jnp.float32(0)),
-        jax.random.fold_in(root_key(play.config.seed, Purpose.ROLLOUT), play.generation),
+        jax.random.fold_in(root_key(play.config.seed, Purpose.ROLLOUT), play.number),
     )

@@ -61,7 +61,7 @@ class TransitionRollouts(Closing):
         """
         self._config, self._task = config, task
         self._runs, self._together = runs, together and runs > 1
-        self._usual = runs * config.n_teams
+        self._usual = runs * (1 if config.in_turns else config.n_teams)
         self._pool = EnvPool(
             task,
             max(self._usual, TESTS_AT_ONCE),
@@ -153,8 +153,7 @@ class TransitionRollouts(Closing):
     def _play(self, plays: Sequence[Play]) -> list[Rollout]:
         spec = self._task.spec
         seeds = [
-            host_seeds(p.config.seed, Purpose.ROLLOUT, p.generation, p.teams.count + 1)
-            for p in plays
+            host_seeds(p.config.seed, Purpose.ROLLOUT, p.number, p.teams.count + 1) for p in plays
         ]
         acting = self._acting([play.teams for play in plays])
         noises: list[np.random.Generator] = []

@@ -19,16 +19,22 @@ class Clock:
         self._rollout = times["rollout_seconds"]
         self._checkpoint_seconds = 60 * checkpoint_minutes
         self._last = self._saved = time.perf_counter()
+        self._before_rollouts = self._generation
 
     def begin_generation(self) -> None:
         """A generation begins."""
         self._tick()
         self._generation = self._rollout = 0.0
 
-    def rolled_out(self) -> None:
-        """Its rollouts are over."""
+    def rolling_out(self) -> None:
+        """Rollouts of it begin."""
         self._tick()
-        self._rollout = self._generation
+        self._before_rollouts = self._generation
+
+    def rolled_out(self) -> None:
+        """They are over."""
+        self._tick()
+        self._rollout += self._generation - self._before_rollouts
 
     def times(self) -> dict[str, float]:
         """Seconds up to now, by the names they have in `race.training.run_state.Progress`."""

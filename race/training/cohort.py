@@ -29,6 +29,7 @@ def kind_of(config: Config) -> tuple[Any, ...]:
         shape_of(config),
         (config.n_population_teams, config.n_marl_teams),
         config.race.population_actions,
+        config.in_turns,
         config.evaluation.episodes,
         config.facmac.replay_precision,
         config.compute,
@@ -93,26 +94,30 @@ def advance(
 def _next(run: Run, state: RunState) -> _Piece:
     if not state.progress.learning:
         return _Piece.TEST if test_due(run.config, state.progress) else _Piece.ROLL_OUT
-    return _Piece.LEARN if owed(run.config, state.progress) > 0 else _Piece.END
+    if owed(run.config, state.progress) > 0:
+        return _Piece.LEARN
+    return _Piece.ROLL_OUT if state.progress.played else _Piece.END
 
 
 def _roll_out(
     runs: Sequence[Run], states: Sequence[RunState], chosen: Sequence[bool]
 ) -> list[Outcome]:
-    """Lines 3 to 6, every team plays its episodes, and 9."""
+    """Lines 3 to 6, every team plays its episodes, and 9; where teams take turns, one of them."""
     playing = [c for c, here in enumerate(chosen) if here]
     for c in playing:
-        runs[c].clock.begin_generation()
+        if not states[c].progress.played:
+            runs[c].clock.begin_generation()
+        runs[c].clock.rolling_out()
     plays = [to_play(runs[c], states[c]) for c in playing]
     results = runs[0].rollouts.play(plays)
     after: list[Outcome] = list(states)
-    for c, play, result in zip(playing, plays, results, strict=True):
+    for c, result in zip(playing, results, strict=True):
         if isinstance(result, DivergenceError):
             after[c] = result
             continue
         replay, played = result
-        state = noted(runs[c], states[c]._replace(replay=replay), played, play.n_marl)
-        after[c] = evolve(runs[c], state)
+        state = noted(runs[c], states[c]._replace(replay=replay), played)
+        after[c] = state if state.progress.played else evolve(runs[c], state)
         jax.block_until_ready(replay)
         runs[c].clock.rolled_out()
     return after

@@ -51,18 +51,33 @@ def warm_up(run: Run, state: RunState) -> RunState:
 
 
 def to_play(run: Run, state: RunState) -> Play:
-    """Lines 3 to 6: the teams of a generation, each as often as it plays an episode."""
+    """Lines 3 to 6: the teams of a generation, each as often as it plays an episode.
+
+    Where they take turns, the next of them.
+    """
     progress, config = state.progress, run.config
+    turn = len(progress.played)
+    generation = progress.generation - (turn > 0)  # counted from 0, and this one has begun
     run.report("rollouts", progress, {})
     teams = run.algorithm.teams(state.algorithm, run.task.spec, run.statics["shape"])
     n_marl = config.n_marl_teams
-    if progress.env_steps - progress.random_steps < config.race.evolution_from and n_marl:
+    if _marl_alone(config, progress):
         teams = teams.at(slice(teams.count - 1, None))  # of a population nobody plays yet
     teams = teams.again(config.race.fitness_episodes, n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
+    if config.in_turns:
+        one, own = teams.at(slice(turn, turn + 1)), int(turn >= teams.count - n_marl)
+        now, replay = progress.env_steps, state.replay
+        return Play(config, one, own, generation, now, replay, turn=turn, turns=config.n_teams)
     judged_early = teams.count > n_marl and _surrogate_due(config, progress)
     steps = config.race.surrogate_steps if judged_early else None
-    return Play(config, teams, n_marl, progress.generation, progress.env_steps, state.replay, steps)
+    return Play(config, teams, n_marl, generation, progress.env_steps, state.replay, steps)
+
+
+def _marl_alone(config: Config, progress: Progress) -> bool:
+    """Whether the MARL team plays alone in the generation that is next, or under way."""
+    begun_at = progress.env_steps_before if progress.played else progress.env_steps
+    return config.has_marl and begun_at - progress.random_steps < config.race.evolution_from
 
 
 def _surrogate_due(config: Config, progress: Progress) -> bool:
@@ -74,31 +89,41 @@ def _surrogate_due(config: Config, progress: Progress) -> bool:
     return bool(np.random.default_rng(int(seeds[0])).random() < share)
 
 
-def noted(run: Run, state: RunState, played: Generation, n_marl: int) -> RunState:
-    """The state with the results of the episodes; the generation's gradient steps are next."""
-    progress, returns = state.progress, played.episode_return.tolist()
-    n_teams = len(returns) - n_marl
-    fitness, of_marl = tuple(returns[:n_teams]), returns[n_teams:]
-    averaged: Returns = ()
-    if played.beginnings is not None:
-        fitness = _judged(run, state, played.beginnings)
-    elif fitness and averages(run.config):
-        averaged = _averaged(run, state, fitness)
-        fitness = means(averaged)
-    progress = progress.but(
-        env_steps_before=progress.env_steps,
-        env_steps=progress.env_steps + played.env_steps,
-        episodes=progress.episodes + len(returns),
-        stored=progress.stored + played.stored,
-        gradient_steps_before=progress.gradient_steps,
-        generation=progress.generation + 1,
-        fitness=fitness,
-        returns=averaged,
-        marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
-        estimated=played.beginnings is not None,
+def noted(run: Run, state: RunState, played: Generation) -> RunState:
+    """The state with the results of the episodes; the gradient steps that they owe are next."""
+    config, before = run.config, state.progress
+    now = played.episode_return.tolist()
+    progress = before.but(
+        env_steps=before.env_steps + played.env_steps,
+        episodes=before.episodes + len(now),
+        stored=before.stored + played.stored,
         learning=True,
-        repeated=progress.repeated + played.repeated,
+        repeated=before.repeated + played.repeated,
     )
+    if not before.played:
+        progress = progress.but(
+            env_steps_before=before.env_steps,
+            gradient_steps_before=before.gradient_steps,
+            generation=before.generation + 1,
+        )
+    returns, n_marl = (*before.played, *now), config.n_marl_teams
+    if len(returns) < (n_marl if _marl_alone(config, before) else config.n_teams):
+        progress = progress.but(played=returns)
+    else:
+        fitness, of_marl = returns[: len(returns) - n_marl], returns[len(returns) - n_marl :]
+        averaged: Returns = ()
+        if played.beginnings is not None:
+            fitness = _judged(run, state, played.beginnings)
+        elif fitness and averages(config):
+            averaged = _averaged(run, state, fitness)
+            fitness = means(averaged)
+        progress = progress.but(
+            played=(),
+            fitness=fitness,
+            returns=averaged,
+            marl_return=sum(of_marl) / len(of_marl) if of_marl else None,
+            estimated=played.beginnings is not None,
+        )
     return _observed(state._replace(progress=progress), played.observed)
 
 
@@ -135,8 +160,8 @@ def _judged(run: Run, state: RunState, begun: Beginnings) -> tuple[float, ...]:
 def _observed(state: RunState, now: Observed | None) -> RunState:
     """The state with what its teams have just seen.
 
-    Statistics change here alone, so that all teams of a generation are shown things alike, and its
-    gradient steps all see the buffer alike. Tests do not count.
+    Statistics change here alone, so that all teams that play at once are shown things alike, and
+    the gradient steps that follow all see the buffer alike. Tests do not count.
     """
     if state.observed is None or now is None:
         return state

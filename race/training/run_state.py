@@ -34,7 +34,11 @@ class Progress:
     generation: int = 0
     """Generations begun."""
     learning: bool = False
-    """Whether the current generation has been rolled out and its gradient steps are under way."""
+    """Whether the current generation has been rolled out, as far as it has, and its gradient steps
+    are under way."""
+    played: tuple[float, ...] = ()
+    """Where teams take turns, training returns of those that have played in the current generation,
+    until all have."""
     gradient_steps_before: int = 0
     """Gradient steps before the current generation."""
     env_steps_before: int = 0

@@ -251,14 +251,14 @@ def progress_of(saved: Checkpoint) -> Progress:
     values = saved.info.get("progress")
     names = {f.name for f in dataclasses.fields(Progress)}
     # Runs of before they were there lack these.
-    later = {"repeated", "estimated", "stored", "returns"}
+    later = {"repeated", "estimated", "stored", "returns", "played"}
     if not isinstance(values, dict) or set(values) | later != names:
         raise CheckpointError(
             f"The checkpoint {saved.path} was not written by this version of race: its record of "
             "the run's progress differs. Use the version named in metadata.json."
         )
     values = {"stored": values["episodes"], **values}  # all of them went into the buffer then
-    listed = ("fitness", "returns")
+    listed = ("fitness", "returns", "played")
     return Progress(**{**values, **{name: tupled(values.get(name, ())) for name in listed}})
 
 

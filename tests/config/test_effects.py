@@ -37,7 +37,7 @@ OTHER: dict[str, Any] = {
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
-    **{"own_share": 0.5, "replayed": "better"},
+    **{"own_share": 0.5, "replayed": "better", "learn_after": "episode"},
     **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
     **{"population_actions": "sampled", "team_heads": "shared"},
     "head_learning_rate": 1e-3,
@@ -79,7 +79,7 @@ def read_on_host(config: Config, group: str, name: str) -> bool:
             return config.has_population and config.race.evolution not in ("cem", "es")
         beside = config.has_population and config.has_marl
         return beside and (
-            name in ("marl_episodes", "evolution_from", "replayed")
+            name in ("marl_episodes", "evolution_from", "replayed", "learn_after")
             or (name == "surrogate_probability" and not (config.discrete or config.whole_teams))
         )
     mine = group == ("facmac" if config.discrete else "learner")

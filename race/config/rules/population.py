@@ -42,6 +42,20 @@ def rules(config: Config) -> list[Rule]:
             "from 0 to 1",
         ),
         *_fitness_rules(race),
+        (
+            race.learn_after == "generation" or race.surrogate_probability == 0,
+            "race.learn-after",
+            race.learn_after,
+            "generation with --race.surrogate-probability above 0, where all of a population are "
+            "judged by one PeVFA",
+        ),
+        (
+            race.learn_after == "generation" or race.replayed == "all",
+            "race.learn-after",
+            race.learn_after,
+            "generation with --race.replayed better: which half of a population is the better one "
+            "is known when all have played",
+        ),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         (
