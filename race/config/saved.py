@@ -62,6 +62,7 @@ _BEFORE: dict[str, Any] = {
     "utility_embedding": "team",
     "vmm_reduction": "mean",
     "mine_negatives": "steps",
+    "mine_embedding_layers": 1,
     "population_actions": "greedy",
     "team_heads": "agent",
     "one_pevfa": False,

@@ -258,6 +258,8 @@ class RaceConfig:
     """Units of the policy embedding network (Table 2)."""
     mine_size: int = 128
     """Units of the MINE networks (Appendix A.1)."""
+    mine_embedding_layers: int = 1
+    """Layers in MINE that encode an embedding, 1 (Appendix A.1) or 2; a state is encoded by two."""
 
 
 def _depths(words: list[str]) -> tuple[tuple[str, ...], ...]:

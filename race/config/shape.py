@@ -48,6 +48,7 @@ class Shape:
     tournament_size: int
     policy_embedding_size: int
     mine_size: int
+    mine_embedding_layers: int
     mutation_draw: MutationDraw
     elite_copy: bool
     evolution: str
@@ -100,6 +101,7 @@ def shape_of(config: Config) -> Shape:
         tournament_size=race.tournament_size * genetic,
         policy_embedding_size=race.policy_embedding_size * represents,
         mine_size=race.mine_size * represents,
+        mine_embedding_layers=race.mine_embedding_layers * represents,
         mutation_draw=race.mutation_draw if genetic and race.mutation_draw else "row",
         elite_copy=race.elite_copy and genetic,
         evolution=race.evolution if evolves else "ga",

@@ -129,6 +129,8 @@ def _population_rules(race: RaceConfig) -> list[Rule]:
     rules += [(value(name) >= 0, name, value(name), "0 or more") for name in not_negative]
     rules += [(value(name) > 0, name, value(name), "above 0") for name in above_0]
     rules += [(value(name) >= 1, name, value(name), "at least 1") for name in positive]
+    layers = race.mine_embedding_layers
+    rules.append((layers in (1, 2), "mine_embedding_layers", layers, "1 or 2"))
     largest, total = race.largest_weight, race.strong_share + race.reset_share
     rules += [
         (total <= 1, "reset_share", race.reset_share, "at most 1 together with the strong share"),
