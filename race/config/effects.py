@@ -28,7 +28,7 @@ _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
     *("pevfa_target", "policy_embedding", "utility_embedding", "head_learning_rate", *_SURROGATE),
-    *(*_OF_EPISODES, "team_heads", "mine_embedding_layers"),
+    *(*_OF_EPISODES, "team_heads", "mine_embedding_layers", "teams_per_batch"),
 )
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),

@@ -52,6 +52,7 @@ _BEFORE: dict[str, Any] = {
     "mutation": "agent",
     "selection": "team",
     "team_draw": "once",
+    "teams_per_batch": 1,
     "marl_among_teams": False,
     "pevfa_target": "target",
     "fitness_episodes": 1,

@@ -207,6 +207,9 @@ class RaceConfig:
     team_draw: TeamDraw = "once"
     """Whether a gradient step draws one team of the population for both Eqs. (1) and (2) or one
     for each."""
+    teams_per_batch: int = 1
+    """Different teams that such a draw takes. The losses of PeVFA and state values and the second
+    term of Eq. (2) are the means over them, each with the whole minibatch."""
     marl_among_teams: bool = False
     """The MARL team is among the teams that are drawn."""
     pevfa_target: PevfaTarget = "target"

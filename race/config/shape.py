@@ -56,6 +56,7 @@ class Shape:
     mutation: Level
     selection: Selection
     team_draw: TeamDraw
+    teams_per_batch: int
     marl_among_teams: bool
     pevfa_target: PevfaTarget
     policy_embedding: PolicyEmbedding
@@ -109,6 +110,7 @@ def shape_of(config: Config) -> Shape:
         mutation=race.mutation if genetic and race.mutation else "agent",
         selection=race.selection if genetic and not config.one_head else "team",
         team_draw=race.team_draw if represents else "once",
+        teams_per_batch=race.teams_per_batch * represents,
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",

@@ -11,6 +11,7 @@ def rules(config: Config) -> list[Rule]:
     """Of a resolved configuration."""
     race, learner = config.race, config.learner
     fewest = 3 + race.elite_copy + config.has_marl
+    n_drawn = race.population_size + race.marl_among_teams
     assert race.vmm_weight is not None
     return [
         (
@@ -43,6 +44,14 @@ def rules(config: Config) -> list[Rule]:
         ),
         *_fitness_rules(race),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
+        (
+            1 <= race.teams_per_batch <= n_drawn,
+            "race.teams-per-batch",
+            race.teams_per_batch,
+            f"from 1 to {n_drawn}, the teams there are to draw from with --race.population-size "
+            f"{race.population_size}"
+            f"{', one more with --race.marl-among-teams' * (not race.marl_among_teams)}",
+        ),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         (
             race.own_share is None or 0 <= race.own_share <= 1,
