@@ -37,6 +37,7 @@ _DRAWN_ANEW = ("cem", "es")
 _OF_EVOLUTIONS = {
     "ga": (
         *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),
+        "places",
         *NUMBERS_OF_EVOLUTIONS["ga"],
     ),
     "cem": NUMBERS_OF_EVOLUTIONS["cem"],
@@ -150,7 +151,8 @@ def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, st
         yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
     elif race.team_heads == "shared" and discrete:
         why = "with --race.team-heads shared, where a team is one policy"
-        yield from ((f"race.{name}", why) for name in ("agent_mutation_probability", "selection"))
+        names = ["agent_mutation_probability", "selection", "places"]
+        yield from ((f"race.{name}", why) for name in names)
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)

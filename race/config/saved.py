@@ -51,6 +51,7 @@ _BEFORE: dict[str, Any] = {
     "crossover": "agent",
     "mutation": "agent",
     "selection": "team",
+    "places": "ranked",
     "team_draw": "once",
     "teams_per_batch": 1,
     "marl_among_teams": False,

@@ -18,6 +18,7 @@ ReplayPrecision = Literal["float16", "float32"]
 MutationDraw = Literal["row", "weight"]
 Level = Literal["agent", "parameter", "layer"]
 Selection = Literal["team", "agent"]
+Places = Literal["ranked", "agent"]
 TeamDraw = Literal["once", "each"]
 PevfaTarget = Literal["target", "online"]
 PolicyEmbedding = Literal["shared", "each"]
@@ -189,6 +190,10 @@ class RaceConfig:
     selection: Selection = "team"
     """Whether parents, and who gives way to offspring, are chosen once per team or for each agent
     anew; fitness and elite are the team's."""
+    places: Places = "ranked"
+    """Where the elite's copy and the offspring go: whole into the places of those that give way, by
+    their fitness, or each agent's heads into these places in a random order of the agent's own, as
+    if each agent evolved by itself."""
     mutation_draw: MutationDraw | None = None
     """Whether a mutation's kind (strong, reset or mild) is drawn once per row or once per weight.
     None: row, with merl and ea weight."""

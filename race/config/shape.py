@@ -9,6 +9,7 @@ from race.config.settings import (
     MineNegatives,
     MutationDraw,
     PevfaTarget,
+    Places,
     PolicyEmbedding,
     Selection,
     TeamDraw,
@@ -55,6 +56,7 @@ class Shape:
     crossover: Level
     mutation: Level
     selection: Selection
+    places: Places
     team_draw: TeamDraw
     teams_per_batch: int
     marl_among_teams: bool
@@ -109,6 +111,7 @@ def shape_of(config: Config) -> Shape:
         crossover=race.crossover if genetic and race.crossover else "agent",
         mutation=race.mutation if genetic and race.mutation else "agent",
         selection=race.selection if genetic and not config.one_head else "team",
+        places=race.places if genetic and not config.one_head else "ranked",
         team_draw=race.team_draw if represents else "once",
         teams_per_batch=race.teams_per_batch * represents,
         marl_among_teams=race.marl_among_teams and represents,

@@ -165,7 +165,7 @@ def check_teams(path: Path, config: Config) -> None:
 SAMPLED = {"population_actions": "sampled"}
 OWN = {"utility_embedding": "agent"}
 OF_EPISODES = {"vmm_reduction": "sum", "mine_negatives": "episodes"}
-MORE = {"teams_per_batch": 2, "mine_embedding_layers": 2}
+MORE = {"teams_per_batch": 2, "mine_embedding_layers": 2, "places": "agent"}
 ONE_HEAD = {"team_heads": "shared"}
 
 
