@@ -286,13 +286,19 @@ def policy_values(
     return mean(values)
 
 
+def encoded(mine: Any, z: np.ndarray) -> np.ndarray:
+    """Embeddings as MINE sees them: through one layer or two."""
+    y = dense(mine.embedding, z)
+    return y if mine.embedding_out is None else dense(mine.embedding_out, leaky(y))
+
+
 def signals(mine: Any, encoder: Any, episodes: list[One], groups: Any) -> list[np.ndarray]:
     """``I_t`` below Eq. (3) of every step, per episode.
 
     ``groups`` lists the steps ``(episode, t)`` that were dealt out together; those behind the end
     of an episode are left out. An agent with one available action has no part.
     """
-    y = [dense(mine.embedding, embeddings(encoder, one)) for one in episodes]
+    y = [encoded(mine, embeddings(encoder, one)) for one in episodes]
     x = [dense(mine.state_out, leaky(dense(mine.state_hidden, one.state))) for one in episodes]
     result = [np.zeros(one.length) for one in episodes]
     for group in groups:
@@ -312,7 +318,7 @@ def signals(mine: Any, encoder: Any, episodes: list[One], groups: Any) -> list[n
 
 def signals_across(mine: Any, encoder: Any, episodes: list[One]) -> list[np.ndarray]:
     """The same, with the embeddings of all agents of other episodes at that time as negatives."""
-    y = [dense(mine.embedding, embeddings(encoder, one)) for one in episodes]
+    y = [encoded(mine, embeddings(encoder, one)) for one in episodes]
     x = [dense(mine.state_out, leaky(dense(mine.state_hidden, one.state))) for one in episodes]
     result = []
     for e, one in enumerate(episodes):

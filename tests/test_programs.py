@@ -123,6 +123,9 @@ def test_shapes_tell_what_is_compiled_anew() -> None:
     assert shape_of(continuous("race", race={"population_size": 6})) != base
     assert shape_of(continuous("race", race={"mutation_draw": "weight"})) != base
     assert shape_of(continuous("race", policy_delay=3)) != base
+    assert shape_of(continuous("race", race={"mine_embedding_layers": 2})) != base
+    assert shape_of(continuous("race", race={"teams_per_batch": 2})) != base
+    assert shape_of(continuous("race", race={"places": "agent"})) != base
     learning = [shape_of(continuous("race", race={"head_learning_rate": x})) for x in (0.1, 0.2)]
     assert learning[0] == learning[1] != base
     assert shape_of(continuous("race", layer_norm=False)) != base

@@ -100,7 +100,7 @@ def update(
     shape: Shape,
     hyper: Hyper,
 ) -> tuple[RaceState, Losses, Losses]:
-    """Lines 8, 10 and 13 on one minibatch, with one team W_j drawn from the population."""
+    """Lines 8, 10 and 13 on one minibatch, with one team W_j of the population or with several."""
     learner = learner_of(shape)
     team_key, critic_key, policy_key = jax.random.split(key, 3)
     policies = parameters(state.policies)
@@ -150,9 +150,9 @@ def update(
 
 
 def _with_heads(
-    population: Population, place: Int[Array, ""], heads: Float[Array, "_ H1 A"]
+    population: Population, place: Int[Array, "*k"], heads: Float[Array, "*k _ H1 A"]
 ) -> Population:
-    """The population in which a team has other heads; the MARL team, drawn, has no place there."""
+    """The population in which teams have other heads; the MARL team, drawn, has no place there."""
     everyone = population.teams.heads.at[place].set(heads, mode="drop")
     return population._replace(teams=population.teams._replace(heads=everyone))
 

@@ -4,6 +4,7 @@ Written once against the learner's interface. A choice of `Shape` is a branch of
 `Hyper` are arguments.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -65,15 +66,29 @@ class Policies(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A team that was drawn, with the heads that are kept of it: one where its agents share it."""
+    """A team that was drawn, with the heads that are kept of it: one where its agents share it.
 
-    heads: Float[Array, "_ H1 A"]
-    place: Int[Array, ""]  # in the population; P is the MARL team
+    Or several, if a gradient step draws several (``k`` is the axis K then, else there is none).
+    """
+
+    heads: Float[Array, "*k _ H1 A"]
+    place: Int[Array, "*k"]  # in the population; P is the MARL team
 
 
-def of_all_agents(head: Float[Array, "_ H1 A"], spec: Spec) -> Float[Array, "N H1 A"]:
+def of_all_agents(head: Float[Array, "*k _ H1 A"], spec: Spec) -> Float[Array, "*k N H1 A"]:
     """A team with a head for every agent, also where its agents share one."""
-    return jnp.broadcast_to(head, (spec.n_agents, *head.shape[1:]))
+    *several, _, inputs, actions = head.shape
+    return jnp.broadcast_to(head, (*several, spec.n_agents, inputs, actions))
+
+
+def _of_each(function: Callable[..., Any], shape: Shape) -> Callable[..., Any]:
+    """What is written for the team that a gradient step draws, for each of them if it draws K."""
+    return jax.vmap(function) if shape.teams_per_batch > 1 else function
+
+
+def _over_teams(x: Float[Array, "..."], shape: Shape) -> Float[Array, "..."]:
+    """The mean over the drawn teams ``[K, ...]``, in place of an expectation over all teams."""
+    return jnp.mean(x, axis=0) if shape.teams_per_batch > 1 else x
 
 
 def _marl_values(
@@ -100,19 +115,27 @@ def draw_teams(
     key: PRNGKeyArray,
     shape: Shape,
 ) -> tuple[Drawn, Drawn]:
-    """The team W_j of Eq. (1) and that of Eq. (2), of the population or of all teams."""
+    """The team W_j of Eq. (1) and that of Eq. (2), of the population or of all teams.
+
+    Or K different ones each, with as many teams in a gradient step.
+    """
     n = shape.population_size + shape.marl_among_teams
 
-    def team(key: PRNGKeyArray) -> Drawn:
-        place = jax.random.randint(key, (), 0, n)
+    def at(place: Int[Array, ""]) -> Drawn:
         if not shape.marl_among_teams:
             return Drawn(heads[place], place)
         drawn = heads[jnp.minimum(place, n - 2)]
         marl = jnp.broadcast_to(marl_head, drawn.shape)
         return Drawn(jnp.where(place == n - 1, marl, drawn), place)
 
-    first = team(key)
-    return first, first if shape.team_draw == "once" else team(jax.random.fold_in(key, 2))
+    def draw(key: PRNGKeyArray) -> Drawn:
+        if shape.teams_per_batch > 1:
+            drawn: Drawn = jax.vmap(at)(jax.random.permutation(key, n)[: shape.teams_per_batch])
+            return drawn
+        return at(jax.random.randint(key, (), 0, n))
+
+    first = draw(key)
+    return first, first if shape.team_draw == "once" else draw(jax.random.fold_in(key, 2))
 
 
 def train_critics(
@@ -121,13 +144,17 @@ def train_critics(
     policies: Policies,
     batch: Any,
     samples: Samples,
-    team: Float[Array, "N H1 A"],
+    team: Float[Array, "*k N H1 A"],
     key: PRNGKeyArray,
     spec: Spec,
     shape: Shape,
     hyper: Hyper,
 ) -> tuple[Critics, Losses, Float[Array, "B"]]:
-    """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch."""
+    """Line 8: Eq. (1) for both critics and Eq. (4); also returns V(s) of the batch.
+
+    Of several teams the losses of the PeVFA and of V are means; chance in target actions is the
+    same for all of them.
+    """
     learner = learner_of(shape)
     now, taken, mask = samples
     later = learner.later(batch, spec)
@@ -137,28 +164,42 @@ def train_critics(
     # policies alone; W_j has no slowly moving copy, but the encoder below it has.
     z = learner.encode(target.encoder, later, spec)
     marl_action = learner.target_action(z, target.head, later, marl_key, spec, hyper)
-    if shape.pevfa_target == "target":
-        team_action = learner.target_action(z, team, later, team_key, spec, hyper)
-    else:
-        online = learner.encode(policies.encoder, later, spec)
-        as_it_is = hyper._replace(smoothing_noise=0.0)
-        team_action = learner.target_action(online, team, later, team_key, spec, as_it_is)
+    below, smoothing = z, hyper
+    if shape.pevfa_target == "online":
+        below = learner.encode(policies.encoder, later, spec)
+        smoothing = hyper._replace(smoothing_noise=0.0)
+
+    def next_action(team: Float[Array, "N H1 A"]) -> Array:
+        return learner.target_action(below, team, later, team_key, spec, smoothing)
+
+    def next_values(team: Float[Array, "N H1 A"], action: Array) -> Values:
+        return learner.q_team(target.pevfa, later, action, team, spec)
+
+    def td_target(values: Float[Array, "K moments"]) -> Float[Array, "B"]:
+        return learner.td_target(batch, learner.pessimistic(values), hyper)
+
+    team_action = _of_each(next_action, shape)(team)
     marl_next = _marl_values(
         target.critic, target.pevfa, later, marl_action, target.head, spec, shape
     )
-    team_next = learner.q_team(target.pevfa, later, team_action, team, spec)
-    y_marl, y_team = (
-        learner.td_target(batch, learner.pessimistic(q), hyper) for q in (marl_next, team_next)
-    )
-    best = best_target(y_marl, y_team)
+    team_next = _of_each(next_values, shape)(team, team_action)
+    y_marl, y_team = td_target(marl_next), _of_each(td_target, shape)(team_next)
+    best = _of_each(lambda y: best_target(y_marl, y), shape)(y_team)
 
     def loss(critics: Critics) -> tuple[Float[Array, ""], tuple[Losses, Float[Array, "B"]]]:
         value = learner.state_values(critics.value, now)
+
+        def pevfa_loss(team: Float[Array, "N H1 A"], y: Float[Array, "B"]) -> Float[Array, ""]:
+            return td_loss(learner.q_team(critics.pevfa, now, taken, team, spec), y, mask)
+
+        def value_loss(best: Float[Array, "B"]) -> Float[Array, ""]:
+            return state_value_loss(value, best, mask)
+
         q_marl = _marl_values(critics.critic, critics.pevfa, now, taken, policies.head, spec, shape)
         losses = {
             "critic": td_loss(q_marl, y_marl, mask),
-            "pevfa": td_loss(learner.q_team(critics.pevfa, now, taken, team, spec), y_team, mask),
-            "value": state_value_loss(value, best, mask),
+            "pevfa": _over_teams(_of_each(pevfa_loss, shape)(team, y_team), shape),
+            "value": _over_teams(_of_each(value_loss, shape)(best), shape),
         }
         # The three share no parameter: the gradient of the sum is each one's own. One PeVFA for
         # all teams learns of both.
@@ -174,17 +215,18 @@ def train_policies(
     critics: Critics,
     target: Targets,
     samples: Samples,
-    kept: Float[Array, "_ H1 A"],
+    kept: Float[Array, "*k _ H1 A"],
     value: Float[Array, "B"],
     step: Int[Array, ""],
     key: PRNGKeyArray,
     spec: Spec,
     shape: Shape,
     hyper: Hyper,
-) -> tuple[Policies, Targets, Losses, Float[Array, "_ H1 A"] | None]:
+) -> tuple[Policies, Targets, Losses, Float[Array, "*k _ H1 A"] | None]:
     """Lines 10 and 13: Eq. (7) for W_marl, Eq. (6) for the encoders, Eq. (3) for MINE.
 
-    Also returns the team W_j after a step of its own, where heads of the population learn.
+    Also returns the team W_j after a step of its own, where heads of the population learn. Of
+    several teams the second term of Eq. (2) is the mean, and each takes the step it would alone.
     """
     learner = learner_of(shape)
     now, _, mask = samples
@@ -210,14 +252,22 @@ def train_policies(
             learner.act(fixed_z, policies.head, now, marl_key, spec),
             weigh_gradient(of_encoder, hyper.vfm_marl_weight),
         )
-        team_action = learner.act(z, team, now, team_key, spec)
+
+        def act(z: Array, team: Float[Array, "*k N H1 A"]) -> Array:
+            every = _of_each(lambda team: learner.act(z, team, now, team_key, spec), shape)
+            actions: Array = every(team)
+            return actions
+
+        def value_of(team: Float[Array, "N H1 A"], action: Array) -> Float[Array, "B"]:
+            return learner.q_team(pevfa, now, action, team, spec)[0]
+
+        team_action = act(z, team)
         team_action = weigh_gradient(team_action, hyper.vfm_team_weight)
         if shape.heads_learn:
             # As for W_marl: the weight is of the encoders' part, and W_j climbs through actions.
-            climbing = learner.act(fixed_z, of_all_agents(own, spec), now, team_key, spec)
-            team_action = graft(climbing, team_action)
+            team_action = graft(act(fixed_z, of_all_agents(own, spec)), team_action)
         q_marl = _marl_values(critic, pevfa, now, marl_action, policies.head, spec, shape)[0]
-        q_team = learner.q_team(pevfa, now, team_action, team, spec)[0]
+        q_team = _over_teams(_of_each(value_of, shape)(team, team_action), shape)
         # The encoders climb the value-weighted signal, MINE the plain bound, each with the other
         # held fixed. Both are the same numbers and are computed once.
         fixed_mine = jax.lax.stop_gradient(policies.mine)
@@ -247,7 +297,12 @@ def train_policies(
     if own is not None:
         # Beyond the paper, whose population evolves alone. A memory of gradients would be another
         # team's after evolution, so that there is none.
-        own = descend_plainly(own, of_team, hyper.head_learning_rate, hyper.gradient_clip)
+        def climb(head: Float[Array, "_ H1 A"], gradient: Any) -> Any:
+            if shape.teams_per_batch > 1:  # it has its share of the mean over teams alone
+                gradient = shape.teams_per_batch * gradient
+            return descend_plainly(head, gradient, hyper.head_learning_rate, hyper.gradient_clip)
+
+        own = _of_each(climb, shape)(own, of_team)
     rates = Policies(
         hyper.encoder_learning_rate, hyper.actor_learning_rate, hyper.critic_learning_rate
     )

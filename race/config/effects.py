@@ -28,7 +28,7 @@ _SHARED_ENCODERS = (
     *("vmm_weight", "vfm_marl_weight", "vfm_team_weight", "value_awareness"),
     *("policy_embedding_size", "mine_size", "team_draw", "marl_among_teams", "one_pevfa"),
     *("pevfa_target", "policy_embedding", "utility_embedding", "head_learning_rate", *_SURROGATE),
-    *(*_OF_EPISODES, "team_heads"),
+    *(*_OF_EPISODES, "team_heads", "mine_embedding_layers", "teams_per_batch"),
 )
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
@@ -38,6 +38,7 @@ _DRAWN_ANEW = ("cem", "es")
 _OF_EVOLUTIONS = {
     "ga": (
         *("crossover", "mutation", "selection", "tournament_size", "elite_copy", "mutation_draw"),
+        "places",
         *NUMBERS_OF_EVOLUTIONS["ga"],
     ),
     "cem": NUMBERS_OF_EVOLUTIONS["cem"],
@@ -151,7 +152,8 @@ def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, st
         yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
     elif race.team_heads == "shared" and discrete:
         why = "with --race.team-heads shared, where a team is one policy"
-        yield from ((f"race.{name}", why) for name in ("agent_mutation_probability", "selection"))
+        names = ["agent_mutation_probability", "selection", "places"]
+        yield from ((f"race.{name}", why) for name in names)
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)

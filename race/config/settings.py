@@ -18,6 +18,7 @@ ReplayPrecision = Literal["float16", "float32"]
 MutationDraw = Literal["row", "weight"]
 Level = Literal["agent", "parameter", "layer"]
 Selection = Literal["team", "agent"]
+Places = Literal["ranked", "agent"]
 TeamDraw = Literal["once", "each"]
 PevfaTarget = Literal["target", "online"]
 PolicyEmbedding = Literal["shared", "each"]
@@ -190,6 +191,10 @@ class RaceConfig:
     selection: Selection = "team"
     """Whether parents, and who gives way to offspring, are chosen once per team or for each agent
     anew; fitness and elite are the team's."""
+    places: Places = "ranked"
+    """Where the elite's copy and the offspring go: whole into the places of those that give way, by
+    their fitness, or each agent's heads into these places in a random order of the agent's own, as
+    if each agent evolved by itself."""
     mutation_draw: MutationDraw | None = None
     """Whether a mutation's kind (strong, reset or mild) is drawn once per row or once per weight.
     None: row, with merl and ea weight."""
@@ -208,6 +213,9 @@ class RaceConfig:
     team_draw: TeamDraw = "once"
     """Whether a gradient step draws one team of the population for both Eqs. (1) and (2) or one
     for each."""
+    teams_per_batch: int = 1
+    """Different teams that such a draw takes. The losses of PeVFA and state values and the second
+    term of Eq. (2) are the means over them, each with the whole minibatch."""
     marl_among_teams: bool = False
     """The MARL team is among the teams that are drawn."""
     pevfa_target: PevfaTarget = "target"
@@ -262,6 +270,8 @@ class RaceConfig:
     """Units of the policy embedding network (Table 2)."""
     mine_size: int = 128
     """Units of the MINE networks (Appendix A.1)."""
+    mine_embedding_layers: int = 1
+    """Layers in MINE that encode an embedding, 1 (Appendix A.1) or 2; a state is encoded by two."""
 
 
 def _depths(words: list[str]) -> tuple[tuple[str, ...], ...]:

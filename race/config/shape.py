@@ -9,6 +9,7 @@ from race.config.settings import (
     MineNegatives,
     MutationDraw,
     PevfaTarget,
+    Places,
     PolicyEmbedding,
     Selection,
     TeamDraw,
@@ -48,13 +49,16 @@ class Shape:
     tournament_size: int
     policy_embedding_size: int
     mine_size: int
+    mine_embedding_layers: int
     mutation_draw: MutationDraw
     elite_copy: bool
     evolution: str
     crossover: Level
     mutation: Level
     selection: Selection
+    places: Places
     team_draw: TeamDraw
+    teams_per_batch: int
     marl_among_teams: bool
     pevfa_target: PevfaTarget
     policy_embedding: PolicyEmbedding
@@ -100,13 +104,16 @@ def shape_of(config: Config) -> Shape:
         tournament_size=race.tournament_size * genetic,
         policy_embedding_size=race.policy_embedding_size * represents,
         mine_size=race.mine_size * represents,
+        mine_embedding_layers=race.mine_embedding_layers * represents,
         mutation_draw=race.mutation_draw if genetic and race.mutation_draw else "row",
         elite_copy=race.elite_copy and genetic,
         evolution=race.evolution if evolves else "ga",
         crossover=race.crossover if genetic and race.crossover else "agent",
         mutation=race.mutation if genetic and race.mutation else "agent",
         selection=race.selection if genetic and not config.one_head else "team",
+        places=race.places if genetic and not config.one_head else "ranked",
         team_draw=race.team_draw if represents else "once",
+        teams_per_batch=race.teams_per_batch * represents,
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",

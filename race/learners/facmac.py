@@ -107,7 +107,8 @@ def new_value(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> StateValue
 
 def new_mine(key: PRNGKeyArray, spec: DiscreteSpec, shape: Shape) -> Mine:
     """A fresh MINE network: one, because there is one encoder (Appendix A.1)."""
-    return init_one_mine(key, spec.state_size, shape.embedding_size, shape.mine_size)
+    size, layers = shape.mine_size, shape.mine_embedding_layers
+    return init_one_mine(key, spec.state_size, shape.embedding_size, size, layers)
 
 
 def now(batch: Slots, spec: DiscreteSpec) -> Samples:

@@ -72,7 +72,8 @@ def new_value(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> StateValue:
 def new_mine(key: PRNGKeyArray, spec: EnvSpec, shape: Shape) -> Mine:
     """One fresh MINE network per encoder."""
     count = 1 if shape.shared_agents else spec.n_agents
-    return networks.init_mine(key, spec, shape.embedding_size, shape.mine_size, count)
+    size, layers = shape.mine_size, shape.mine_embedding_layers
+    return networks.init_mine(key, spec, shape.embedding_size, size, layers, count)
 
 
 def now(batch: Transition, spec: EnvSpec) -> Samples:

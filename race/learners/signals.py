@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from race.config.shape import Shape
 from race.learners.moments import Moments
 from race.method.equations import mutual_information_signal, mutual_information_signal_across
-from race.networks.dense import Mine, encode_state
+from race.networks.dense import Mine, encode_embedding, encode_state
 
 GROUP = 32
 """Steps among which MINE's pairs are made."""
@@ -56,7 +56,7 @@ def _against_other_steps(
 
     state, embedding, count = dealt(moments.state), dealt(z), dealt(counted)
     x = encode_state(mine, state.reshape(groups * GROUP, -1)).reshape(groups, GROUP, -1)
-    y = mine.embedding(embedding.reshape(groups * GROUP * agents, -1))
+    y = encode_embedding(mine, embedding.reshape(groups * GROUP * agents, -1))
     y = y.reshape(groups, GROUP, agents, -1)
     scores = jnp.einsum("gtm,gknm->gntk", x, y)
     signal = jax.vmap(jax.vmap(mutual_information_signal, in_axes=(0, 1)))(scores, count)
@@ -82,7 +82,7 @@ def _against_other_episodes(
     """The embeddings of all agents of the other episodes at the same time are the negatives."""
     agents, samples = z.shape[2], z.shape[0] * z.shape[1]
     x = encode_state(mine, moments.state.reshape(samples, -1))
-    y = mine.embedding(z.reshape(samples * agents, -1)).reshape(samples, agents, -1)
+    y = encode_embedding(mine, z.reshape(samples * agents, -1)).reshape(samples, agents, -1)
     places = of_each_time(moments.first, moments.real > 0, episodes)
 
     def at_places(flat: Array) -> Array:

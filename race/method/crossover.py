@@ -128,9 +128,9 @@ def breed(
 ) -> Bred:
     """Fills the places of the teams that are neither elite nor parent.
 
-    From the fittest of these places down: with ``elite_copy`` a copy of the elite, then offspring
-    of elite and parent. Each crossover gives two offspring, one that begins as the elite and one as
-    the parent, and there are as many crossovers as it takes.
+    In the order of these places, for each agent its own: with ``elite_copy`` a copy of the elite,
+    then offspring of elite and parent. Each crossover gives two offspring, one that begins as the
+    elite and one as the parent, and there are as many crossovers as it takes.
 
     Args:
         teams: the population, leaves [P, N, ...].
@@ -176,6 +176,18 @@ def breed(
         first.at[places, agents].set(jnp.where(happens[:, None], gives, begins)),
         jnp.zeros(own.shape).at[places, agents].set(share),
     )
+
+
+def told_of_each_agent(made: Bred) -> Bred:
+    """The same, where an agent whose policy is one team's alone has no second.
+
+    Where places were dealt to each agent, a team has agents of several offspring, and all of them
+    may be one parent's: it is a copy then.
+    """
+    whole, none = made.share == 1, made.share == 0
+    first = jnp.where(whole, made.second, made.first)
+    second = jnp.where(whole | none, first, made.second)
+    return made._replace(first=first, second=second, share=jnp.where(whole, 0.0, made.share))
 
 
 def inject(teams: Team, team: Team, place: Int[Array, ""]) -> Team:

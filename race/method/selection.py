@@ -18,7 +18,7 @@ class Selection(NamedTuple):
 
     elite: Int[Array, ""]  # team of the highest fitness
     parent: Int[Array, "N"]  # winner of the tournament, never the elite
-    replaced: Int[Array, "P-2 N"]  # all other teams, from the fittest to the least fit
+    replaced: Int[Array, "P-2 N"]  # all other teams, in the order in which they give way
     worst: Int[Array, ""]  # team of the lowest fitness
 
 
@@ -38,6 +38,8 @@ def select(
     per_agent: bool = False,
 ) -> Selection:
     """Elite selection and the tournament for the second parent.
+
+    The others give way from the fittest to the least fit.
 
     The tournament is held among the teams that are not the elite, drawn without replacement, so
     that crossover always has two different parents.
@@ -68,3 +70,15 @@ def select(
         parent = jnp.broadcast_to(winner, (n_agents,))
         rest = jnp.broadcast_to(behind, (n_agents, n_others - 1))
     return Selection(ranked[0], parent, rest.T, ranked[-1])
+
+
+def deal_places(chosen: Selection, key: PRNGKeyArray) -> Selection:
+    """The same roles with places that give way in a random order, for each agent another.
+
+    What is bred for the first of them, the second and so on (`race.method.crossover.breed`) then
+    comes into another team for each agent. The paper leaves open whether it does; elite, second
+    parent and the place of the lowest fitness are as they were.
+    """
+    keys = jax.random.split(key, chosen.replaced.shape[1])
+    dealt = jax.vmap(jax.random.permutation, in_axes=(0, 1), out_axes=1)(keys, chosen.replaced)
+    return chosen._replace(replaced=dealt)

@@ -205,27 +205,43 @@ class Mine(eqx.Module):
     state_hidden: Dense  # weight [N, S, M]
     state_out: Dense  # weight [N, M, M]
     embedding: Dense  # weight [N, H, M]
+    embedding_out: Dense | None = None  # weight [N, M, M]; beyond the paper, which has one layer
 
 
-def init_mine(key: PRNGKeyArray, spec: EnvSpec, embedding_size: int, size: int, count: int) -> Mine:
-    """Fresh networks, one per encoder (Appendix A.1)."""
+def init_mine(
+    key: PRNGKeyArray, spec: EnvSpec, embedding_size: int, size: int, layers: int, count: int
+) -> Mine:
+    """Fresh networks, one per encoder (Appendix A.1), with 1 or 2 layers for embeddings."""
     keys = jax.random.split(key, count)
-    return stack([init_one_mine(k, spec.state_size, embedding_size, size) for k in keys])
+    return stack([init_one_mine(k, spec.state_size, embedding_size, size, layers) for k in keys])
 
 
-def init_one_mine(key: PRNGKeyArray, state_size: int, embedding_size: int, size: int) -> Mine:
+def init_one_mine(
+    key: PRNGKeyArray, state_size: int, embedding_size: int, size: int, layers: int
+) -> Mine:
     """A fresh network, not stacked."""
     k1, k2, k3 = jax.random.split(key, 3)
     return Mine(
         init_dense(k1, state_size, size),
         init_dense(k2, size, size),
         init_dense(k3, embedding_size, size),
+        # A key beside the others, so that these are the same with one layer and with two.
+        init_dense(jax.random.fold_in(key, 3), size, size) if layers == 2 else None,
     )
 
 
 def encode_state(mine: Mine, state: Float[Array, "*b S"]) -> Float[Array, "*b M"]:
     """What `mine_scores` compares an embedding's encoding with (Appendix A.1)."""
     return jax.nn.leaky_relu(mine.state_out(jax.nn.leaky_relu(mine.state_hidden(state))))
+
+
+def encode_embedding(mine: Mine, z: Float[Array, "*b H"]) -> Float[Array, "*b M"]:
+    """The encoding of an embedding, which no activation follows.
+
+    It is one layer (Appendix A.1), or two with a leaky_relu between them.
+    """
+    x = mine.embedding(z)
+    return x if mine.embedding_out is None else mine.embedding_out(jax.nn.leaky_relu(x))
 
 
 def mine_scores(
@@ -242,6 +258,6 @@ def mine_scores(
     count = mine.state_out.bias.shape[0]
     x = jnp.broadcast_to(state, (count, *state.shape))
     x = encode_state(mine, x)
-    y = mine.embedding(z.reshape(count, -1, z.shape[2])).reshape(*z.shape[:2], -1)
+    y = encode_embedding(mine, z.reshape(count, -1, z.shape[2])).reshape(*z.shape[:2], -1)
     x = jnp.broadcast_to(x, (z.shape[0], *x.shape[1:]))
     return jnp.einsum("ntm,nkm->ntk", x, y)

@@ -89,23 +89,24 @@ def test_heads_wait_for_the_policy_delay(world: World) -> None:
 
 
 @pytest.mark.parametrize(
-    ("team_draw", "marl_among_teams"),
-    [("once", False), pytest.param("each", True, marks=pytest.mark.slow)],
+    ("team_draw", "marl_among_teams", "count"),
+    [("once", False, 1), *(pytest.param("each", True, k, marks=pytest.mark.slow) for k in (1, 2))],
 )
 def test_the_team_of_equation_2_moves_and_no_other(
-    world_of: Callable[..., World], team_draw: str, marl_among_teams: bool
+    world_of: Callable[..., World], team_draw: str, marl_among_teams: bool, count: int
 ) -> None:
-    world = world_of(team_draw=team_draw, marl_among_teams=marl_among_teams)
+    several = {} if count == 1 else {"teams_per_batch": count}
+    world = world_of(team_draw=team_draw, marl_among_teams=marl_among_teams, **several)
     state, head = world.state, world.state.policies.head.params
     places, unlike = set(), 0
     for key in KEYS:
         first, second = draw_teams(state.heads, head, jax.random.split(key, 3)[0], world.shape)
-        place = int(second.place)
+        drawn = sorted(np.asarray(second.place).reshape(-1).tolist())
         after, *_ = world.step(1, key)
         # The MARL team, where it is drawn, learns by Eq. (7) alone.
-        assert world.moved(after) == ([place] if place < len(state.heads) else [])
-        places.add(place)
-        unlike += int(first.place) != place
+        assert world.moved(after) == [place for place in drawn if place < len(state.heads)]
+        places.update(drawn)
+        unlike += sorted(np.asarray(first.place).reshape(-1).tolist()) != drawn
     assert places == set(range(5 + marl_among_teams))
     assert (unlike > 0) == (team_draw == "each")
 

@@ -173,3 +173,38 @@ def test_parents_of_each_agent(tiny_spec: EnvSpec, tiny_config: Callable[..., Co
         for team in told(after):
             several += isinstance(team.get("parents", [0])[0], list)
     assert several
+
+
+def test_teams_whose_agents_come_from_different_places(
+    tiny_spec: EnvSpec, tiny_config: Callable[..., Config]
+) -> None:
+    """Where they are dealt out: a team is told as a copy only if all of it is one team's."""
+    race = {"population_size": P, "places": "agent"}
+    world = World(tiny_spec, tiny_config("race", "matd3", race=race))
+    old, found = np.asarray(world.start.teams.heads), set()
+    for seed in range(12):
+        after = world.evolve(world.start, FITNESS, seed, mutation_probability=0.0)
+        new = np.asarray(after.teams.heads)
+        assert int(after.worst) == 2
+        for place, team in enumerate(told(after)):
+            sources = [
+                [was for was in range(P) if np.array_equal(new[place, i], old[was, i])]
+                for i in range(2)
+            ]
+            (one,), (two,) = sources
+            assert {one, two} <= {1, 3}
+            if place in (1, 3):
+                assert team["origin"] == {1: "elite", 3: "parent"}[place]
+                assert (team["id"], one, two) == (place,) * 3
+                continue
+            assert team["id"] >= P
+            assert team["origin"] == ("copy" if one == two else "offspring")
+            assert team["parents"] == ([one] if one == two else [[one], [two]])
+            assert "from_second" not in team
+            crossed = int(after.record.now.operator[place])
+            assert crossed == (one != two)
+            found.add((one, two))
+        entered = world.inject(after)
+        np.testing.assert_array_equal(entered.teams.heads[2], world.marl.heads)
+        assert told(entered)[2]["origin"] == "injected"
+    assert found == {(1, 1), (1, 3), (3, 1), (3, 3)}

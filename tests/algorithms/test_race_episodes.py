@@ -55,7 +55,10 @@ from race.algorithms.marl import MarlState
 from race.algorithms.marl import Targets as MarlTargets
 from race.config.settings import Config
 
-CHOSEN = {"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"}
+CHOSEN: dict[str, Any] = {
+    **{"utility_embedding": "agent", "vmm_reduction": "sum", "mine_negatives": "episodes"},
+    "mine_embedding_layers": 2,
+}
 
 
 # Gradients are small here beside the heads, which a step of 1e3 of them does not lose in rounding.

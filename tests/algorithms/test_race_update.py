@@ -104,7 +104,10 @@ def v_zeta(value: Any, s: np.ndarray) -> float:
 def t_omega(mine: Any, agent: int, s: np.ndarray, z: np.ndarray) -> float:
     x = leaky(s @ mine.state_hidden.weight[agent] + mine.state_hidden.bias[agent])
     x = leaky(x @ mine.state_out.weight[agent] + mine.state_out.bias[agent])
-    return float(x @ (z @ mine.embedding.weight[agent] + mine.embedding.bias[agent]))
+    y = z @ mine.embedding.weight[agent] + mine.embedding.bias[agent]
+    if mine.embedding_out is not None:
+        y = leaky(y) @ mine.embedding_out.weight[agent] + mine.embedding_out.bias[agent]
+    return float(x @ y)
 
 
 def signals(encoder: Any, mine: Any, spec: EnvSpec, batch: Any, agent: int) -> list[float]:
@@ -278,7 +281,7 @@ def drawn_team(before: Any, pevfa_loss_seen: float, f: Frozen) -> np.ndarray:
     scope="module",
     params=[
         *((base, True, 0.0) for base in ("matd3", "maddpg", "facmac")),
-        ("matd3", False, 0.5),
+        ("matd3", False, 0.5),  # with a second layer for embeddings in MINE
         pytest.param(("facmac", True, 0.5), marks=pytest.mark.slow),
     ],
     ids=lambda param: "-".join(
@@ -294,7 +297,10 @@ def stepped(
 ) -> Step:
     base, layer_norm, rate = request.param
     config = tiny_config(
-        "race", base, learner={"layer_norm": layer_norm}, race={"head_learning_rate": rate}
+        "race",
+        base,
+        learner={"layer_norm": layer_norm},
+        race={"head_learning_rate": rate, "mine_embedding_layers": 1 if layer_norm else 2},
     )
     before = separate(race.init(jax.random.key(11), tiny_spec, shape_of(config), hyper_of(config)))
     batch = batch_of(tiny_spec, B)

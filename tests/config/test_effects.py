@@ -35,6 +35,7 @@ OTHER: dict[str, Any] = {
     **{"replay_precision": "float16", "mutation_draw": "row"},
     **{"mutation_fraction": 0.25, "vmm_weight": 0.03, "encoder_learning_rate": 0.02},
     **{"crossover": "parameter", "mutation": "parameter", "selection": "agent"},
+    "places": "agent",
     **{"team_draw": "each", "evolution": "another:operator"},
     **{"pevfa_target": "online", "policy_embedding": "each", "surrogate_probability": 0.5},
     **{"own_share": 0.5, "replayed": "better", "learn_after": "episode"},

@@ -46,6 +46,8 @@ _SETTINGS: dict[str, str] = {
     "race.tournament-size": "0 -1 99999999999",
     "race.policy-embedding-size": "0 16385",
     "race.mine-size": "0 16385 100000000000",
+    "race.teams-per-batch": "0 -1 6 100000000000",
+    "race.mine-embedding-layers": "0 3 100000000000",
     "env.retries": "-1 1001 99999999999999999999",
     "env.step-seconds": "0 -1 nan inf 1e7",
     "evaluation.every": "0 -1 99999999999999999999",

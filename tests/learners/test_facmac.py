@@ -42,7 +42,7 @@ from tiny_episodes import (
 from race.algorithms.base import Teams
 from race.config.hyper import hyper_of
 from race.config.settings import Config
-from race.config.shape import shape_of
+from race.config.shape import Shape, shape_of
 from race.learners import facmac
 from race.learners.facmac import Moments, logits
 from race.networks.factored import embedding_shifts, mix
@@ -63,10 +63,10 @@ class Networks:
     """Fresh networks, with larger weights so that every non-linearity matters."""
 
     def __init__(self, config: Config) -> None:
-        def fresh(init: Callable[..., Any], seed: int) -> Any:
-            network = jax.jit(partial(init, spec=SPEC, shape=shape_of(config)))(
-                jax.random.key(seed)
-            )
+        shape = shape_of(config)
+
+        def fresh(init: Callable[..., Any], seed: int, shape: Shape = shape) -> Any:
+            network = jax.jit(partial(init, spec=SPEC, shape=shape))(jax.random.key(seed))
             return jax.tree.map(lambda x: 2.0 * x, network)
 
         self.encoder = fresh(facmac.init_encoder, 0)
@@ -76,6 +76,8 @@ class Networks:
         self.pevfa = fresh(facmac.init_pevfa, 4)
         self.value = fresh(facmac.init_value, 5)
         self.mine = fresh(facmac.init_mine, 6)
+        deeper = dataclasses.replace(shape, mine_embedding_layers=2)
+        self.deeper_mine = fresh(facmac.init_mine, 6, deeper)
 
 
 @pytest.fixture(scope="module")
@@ -381,10 +383,11 @@ def test_signals_of_the_steps_as_dealt(
     monkeypatch.setattr(module, "GROUP", GROUP)
     monkeypatch.setattr(module, "deal_out", lambda key, moment, real: jnp.asarray(deal))
     z = facmac.encode(nets.encoder, now.moments, SPEC)
-    got = facmac.mutual_information(nets.mine, now.moments, z, KEY, shape_of(config))
+    mine = nets.mine if seed != 1 else nets.deeper_mine
+    got = facmac.mutual_information(mine, now.moments, z, KEY, shape_of(config))
     assert got.shape == (1, B)
     groups = groups_of(laid, deal)
-    expected = signals(float64(nets.mine), float64(nets.encoder), episodes_of(batch), groups)
+    expected = signals(float64(mine), float64(nets.encoder), episodes_of(batch), groups)
     for signal, of_episode in zip(laid.steps(got[0]), expected, strict=True):
         np.testing.assert_allclose(signal, of_episode, rtol=1e-4, atol=1e-5)
     # What is no step has no signal, nor has a step at which all agents are dead.
@@ -398,9 +401,10 @@ def test_signals_against_other_episodes_at_the_same_time(
 ) -> None:
     shape = dataclasses.replace(shape_of(config), mine_negatives="episodes", batch_size=most)
     z = facmac.encode(nets.encoder, now.moments, SPEC)
-    got = facmac.mutual_information(nets.mine, now.moments, z, KEY, shape)
+    mine = nets.mine if most == E else nets.deeper_mine
+    got = facmac.mutual_information(mine, now.moments, z, KEY, shape)
     assert got.shape == (1, B)
-    expected = signals_across(float64(nets.mine), float64(nets.encoder), episodes_of(batch))
+    expected = signals_across(float64(mine), float64(nets.encoder), episodes_of(batch))
     for signal, of_episode in zip(laid.steps(got[0]), expected, strict=True):
         np.testing.assert_allclose(signal, of_episode, rtol=1e-4, atol=1e-5)
     assert (np.asarray(got[0])[np.asarray(now.mask) == 0] == 0).all()

@@ -10,7 +10,7 @@ import pytest
 from frequencies import KEYS, assert_frequency
 
 from race.method import crossover
-from race.method.selection import Selection
+from race.method.selection import Selection, deal_places
 from race.types import Team
 
 TEAMS = (1, 2, 6)
@@ -183,6 +183,49 @@ def test_agents_may_have_parents_of_their_own() -> None:
     assert bred.first[3].tolist() == [0, 1]
     source = np.where(bred.share > 0.5, bred.second, bred.first)
     np.testing.assert_array_equal(bred.teams.heads, heads[source, jnp.arange(2)])
+
+
+@pytest.mark.parametrize("level", ["agent", "parameter"])
+def test_places_of_each_agent_hold_what_ranked_places_hold(level: Any) -> None:
+    """Every agent has the same heads as with ranked places, each somewhere."""
+    teams, mask = whole_teams(6, 3), jnp.ones((3, 3), bool)
+    ranked = of_roles(6, 3, 4, 1)
+
+    def both(key: jax.Array) -> Any:
+        breed = partial(crossover.breed, elite_copy=True, level=level)
+        dealt = deal_places(ranked, jax.random.fold_in(key, 9))
+        return [breed(teams, chosen, mask, 1.0, key) for chosen in (ranked, dealt)], dealt.replaced
+
+    (one, two), places = jax.jit(jax.vmap(both))(KEYS[:200])
+    apart = np.asarray(places)
+    for kept in (4, 1):
+        for leaf, old in zip(*map(jax.tree.leaves, (two.teams, teams)), strict=True):
+            assert (np.asarray(leaf)[:, kept] == np.asarray(old)[kept]).all()
+    of_one, of_two = (
+        [*jax.tree.leaves(made.teams), made.first, made.second, made.share] for made in (one, two)
+    )
+    for a, b in zip(of_one, of_two, strict=True):
+        for k, place in enumerate((0, 2, 3, 5)):
+            for agent in range(3):
+                there = apart[:, k, agent]
+                moved = np.asarray(b)[np.arange(len(there)), there, agent]
+                np.testing.assert_array_equal(moved, np.asarray(a)[:, place, agent])
+    together = (apart == apart[:, :, :1]).all(axis=2)
+    assert_frequency(together[:, 0].sum(), 1 / 16, len(together))
+
+
+def test_an_agent_of_one_team_alone_has_no_second() -> None:
+    none, whole, part = 0.0, 1.0, 0.25
+    made = crossover.Bred(
+        None,
+        first=jnp.array([[4, 1, 4], [4, 4, 1]]),
+        second=jnp.array([[4, 4, 1], [1, 1, 4]]),
+        share=jnp.array([[none, whole, none], [whole, part, none]]),
+    )
+    told = crossover.told_of_each_agent(made)
+    assert told.first.tolist() == [[4, 4, 4], [1, 4, 1]]
+    assert told.second.tolist() == [[4, 4, 4], [1, 1, 1]]
+    assert told.share.tolist() == [[0, 0, 0], [0, 0.25, 0]]
 
 
 @pytest.mark.parametrize("place", [0, 2])

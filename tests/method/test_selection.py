@@ -78,6 +78,29 @@ def test_fitness_that_is_nowhere_finite_still_gives_roles(value: float) -> None:
 
 
 @pytest.mark.parametrize("per_agent", [False, True])
+def test_places_are_dealt_to_each_agent_by_itself(per_agent: bool) -> None:
+    fitness = jnp.array([1.0, 9.0, 0.0, 4.0, 2.0])
+
+    def both(key: jax.Array) -> Any:
+        chosen = selection.select(fitness, 10, key, 2, per_agent)
+        return chosen, selection.deal_places(chosen, jax.random.fold_in(key, 3))
+
+    chosen, dealt = jax.jit(jax.vmap(both))(KEYS)
+    for name in ("elite", "parent", "worst"):
+        np.testing.assert_array_equal(getattr(dealt, name), getattr(chosen, name))
+    assert (np.asarray(dealt.worst) == 2).all()
+    before, after = np.asarray(chosen.replaced), np.asarray(dealt.replaced)
+    np.testing.assert_array_equal(np.sort(after, axis=1), np.sort(before, axis=1))
+    for team in (4, 0, 2):
+        for rank in range(3):
+            for agent in range(2):
+                assert_frequency((after[:, rank, agent] == team).sum(), 1 / 3, len(KEYS))
+            # Agents know nothing of each other.
+            both_there = (after[:, rank] == team).all(axis=1)
+            assert_frequency(both_there.sum(), 1 / 9, len(KEYS))
+
+
+@pytest.mark.parametrize("per_agent", [False, True])
 def test_agents_share_a_tournament_or_have_one_each(per_agent: bool) -> None:
     fitness = jnp.array([1.0, 9.0, 0.0, 4.0, 2.0])
     chosen = jax.jit(jax.vmap(lambda key: selection.select(fitness, 2, key, 3, per_agent)))(KEYS)

@@ -169,8 +169,9 @@ def test_policy_embedding_averages_over_actions(tiny_spec: EnvSpec, head: Any) -
     assert not np.allclose(embed_policy(embedding, vectors.at[2, 0].add(1.0)), e)
 
 
-def test_mine_scores_every_pair(tiny_spec: EnvSpec, state: jax.Array) -> None:
-    mine = init_mine(jax.random.key(6), tiny_spec, H, 6, tiny_spec.n_agents)
+@pytest.mark.parametrize("layers", [1, 2])
+def test_mine_scores_every_pair(tiny_spec: EnvSpec, state: jax.Array, layers: int) -> None:
+    mine = init_mine(jax.random.key(6), tiny_spec, H, 6, layers, tiny_spec.n_agents)
     z = jax.random.normal(jax.random.key(7), (2, B, H))
     scores = mine_scores(mine, state, z)
     w, s, z64 = float64(mine), float64(state), float64(z)
@@ -180,4 +181,24 @@ def test_mine_scores_every_pair(tiny_spec: EnvSpec, state: jax.Array) -> None:
             x = leaky(x @ w.state_out.weight[agent] + w.state_out.bias[agent])
             for k in range(B):
                 y = z64[agent, k] @ w.embedding.weight[agent] + w.embedding.bias[agent]
+                if layers == 2:
+                    out = w.embedding_out
+                    y = leaky(y) @ out.weight[agent] + out.bias[agent]
                 np.testing.assert_allclose(scores[agent, t, k], x @ y, rtol=1e-4, atol=1e-6)
+
+
+def test_a_second_layer_in_mine_leaves_the_others_as_they_are(tiny_spec: EnvSpec) -> None:
+    """And without one there is no leaf more in a checkpoint."""
+    one, two = (
+        init_mine(jax.random.key(6), tiny_spec, H, 6, layers, tiny_spec.n_agents)
+        for layers in (1, 2)
+    )
+    assert one.embedding_out is None
+    assert two.embedding_out.weight.shape == (tiny_spec.n_agents, 6, 6)
+    without = dataclasses.replace(two, embedding_out=None)
+    assert jax.tree.structure(without) == jax.tree.structure(one)
+    for a, b in zip(*map(jax.tree.leaves, (without, one)), strict=True):
+        assert jnp.array_equal(a, b)
+    weights = [two.state_out.weight[0], *two.embedding_out.weight]
+    for i, a in enumerate(weights):  # no layer is a copy of another
+        assert not any(np.isclose(a, b).any(axis=1).all() for b in weights[:i])

@@ -165,13 +165,14 @@ def check_teams(path: Path, config: Config) -> None:
 SAMPLED = {"population_actions": "sampled"}
 OWN = {"utility_embedding": "agent"}
 OF_EPISODES = {"vmm_reduction": "sum", "mine_negatives": "episodes"}
+MORE = {"teams_per_batch": 2, "mine_embedding_layers": 2, "places": "agent"}
 ONE_HEAD = {"team_heads": "shared"}
 
 
 @pytest.mark.parametrize(
     ("algo", "task", "race"),
     [
-        ("race", "probe/lives", {**SAMPLED, **OWN, **OF_EPISODES}),
+        ("race", "probe/lives", {**SAMPLED, **OWN, **OF_EPISODES, **MORE}),
         pytest.param("race", "probe/lives", ONE_HEAD, marks=pytest.mark.slow),
         pytest.param("race", "probe/terminates", OWN, marks=pytest.mark.slow),
         *(

@@ -9,9 +9,9 @@ from race.algorithms.evolutions.base import Evolution
 from race.algorithms.population import Population, fittest, met
 from race.config.hyper import Hyper
 from race.config.shape import Shape
-from race.method.crossover import breed
+from race.method.crossover import breed, told_of_each_agent
 from race.method.mutation import mutate_population
-from race.method.selection import select
+from race.method.selection import deal_places, select
 from race.types import Spec, Team
 
 
@@ -32,6 +32,8 @@ def evolve(
     mask = jnp.asarray(spec.action_mask)
     per_agent = shape.selection == "agent"
     chosen = select(fitness, shape.tournament_size, select_key, spec.n_agents, per_agent)
+    if shape.places == "agent":
+        chosen = deal_places(chosen, jax.random.fold_in(key, 3))
     population = fittest(population, fitness, chosen.elite)
     population = met(population, jnp.zeros(fitness.shape, bool).at[chosen.parent].set(True))
     made = breed(
@@ -43,6 +45,8 @@ def evolve(
         shape.elite_copy,
         shape.crossover,
     )
+    if shape.places == "agent":
+        made = told_of_each_agent(made)
     teams, changes = mutate_population(
         made.teams, chosen.elite, mask, hyper, mutate_key, shape.mutation_draw, shape.mutation
     )

@@ -11,6 +11,7 @@ def rules(config: Config) -> list[Rule]:
     """Of a resolved configuration."""
     race, learner = config.race, config.learner
     fewest = 3 + race.elite_copy + config.has_marl
+    n_drawn = race.population_size + race.marl_among_teams
     assert race.vmm_weight is not None
     return [
         (
@@ -57,6 +58,14 @@ def rules(config: Config) -> list[Rule]:
             "is known when all have played",
         ),
         (race.surrogate_steps >= 1, "race.surrogate-steps", race.surrogate_steps, "at least 1"),
+        (
+            1 <= race.teams_per_batch <= n_drawn,
+            "race.teams-per-batch",
+            race.teams_per_batch,
+            f"from 1 to {n_drawn}, the teams there are to draw from with --race.population-size "
+            f"{race.population_size}"
+            f"{', one more with --race.marl-among-teams' * (not race.marl_among_teams)}",
+        ),
         (race.evolution_from >= 0, "race.evolution-from", race.evolution_from, "0 or more"),
         (
             race.own_share is None or 0 <= race.own_share <= 1,
@@ -143,6 +152,8 @@ def _population_rules(race: RaceConfig) -> list[Rule]:
     rules += [(value(name) >= 0, name, value(name), "0 or more") for name in not_negative]
     rules += [(value(name) > 0, name, value(name), "above 0") for name in above_0]
     rules += [(value(name) >= 1, name, value(name), "at least 1") for name in positive]
+    layers = race.mine_embedding_layers
+    rules.append((layers in (1, 2), "mine_embedding_layers", layers, "1 or 2"))
     largest, total = race.largest_weight, race.strong_share + race.reset_share
     rules += [
         (total <= 1, "reset_share", race.reset_share, "at most 1 together with the strong share"),
