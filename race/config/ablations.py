@@ -129,6 +129,11 @@ def ablated(config: Config, names: Sequence[str], discrete: bool = False) -> Con
             f"--ablation shared-agents changes nothing on {config.task}: on discrete actions all "
             "agents share an encoder anyway. Leave it out."
         )
+    if discrete and "parameter-crossover" in names and config.race.team_heads == "shared":
+        raise ConfigError(
+            "--ablation parameter-crossover changes nothing with --race.team-heads shared: where a "
+            "team has one head there is no other crossover. Leave one of the two out."
+        )
     of_genetics = [name for name in names if name in _OF_GENETICS]
     if of_genetics and config.race.evolution != "ga":
         raise ConfigError(

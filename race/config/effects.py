@@ -30,6 +30,7 @@ _SHARED_ENCODERS = (
     *("pevfa_target", "policy_embedding", "utility_embedding", "head_learning_rate", *_SURROGATE),
     *(*_OF_EPISODES, "team_heads", "mine_embedding_layers", "teams_per_batch"),
 )
+_OF_UNLIKE_AGENTS = ("agent_mutation_probability", "selection", "places", "utility_embedding")
 _BESIDE_MARL = (
     *("injection_probability", "marl_episodes", "evolution_from", "own_share", "replayed"),
     "learn_after",
@@ -152,8 +153,7 @@ def _idle_of_population(asked: Config, discrete: bool) -> Iterator[tuple[str, st
         yield from ((f"race.{name}", f"{own}: each team has networks of its own") for name in names)
     elif race.team_heads == "shared" and discrete:
         why = "with --race.team-heads shared, where a team is one policy"
-        names = ["agent_mutation_probability", "selection", "places"]
-        yield from ((f"race.{name}", why) for name in names)
+        yield from ((f"race.{name}", why) for name in _OF_UNLIKE_AGENTS)
     if not asked.has_marl:
         why = f"with --algo {asked.algo}, which has no MARL team"
         yield from ((f"race.{name}", why) for name in _BESIDE_MARL)

@@ -117,7 +117,9 @@ def shape_of(config: Config) -> Shape:
         marl_among_teams=race.marl_among_teams and represents,
         pevfa_target=race.pevfa_target if represents else "target",
         policy_embedding=race.policy_embedding if represents and twins else "shared",
-        utility_embedding=race.utility_embedding if represents and mixes else "team",
+        utility_embedding=(
+            race.utility_embedding if represents and mixes and not config.one_head else "team"
+        ),
         vmm_reduction=race.vmm_reduction if represents and discrete else "mean",
         mine_negatives=race.mine_negatives if represents and discrete else "steps",
         team_heads="shared" if config.one_head else "agent",

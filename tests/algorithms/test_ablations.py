@@ -267,6 +267,10 @@ def test_ablations_of_another_method_or_against_a_setting_are_refused() -> None:
         ablated(Config("probe/target", algo="matd3"), ["vfm-only"])
     with pytest.raises(ConfigError, match="all agents share an encoder anyway"):
         ablated(Config("probe/climb"), ["shared-agents"], discrete=True)
+    one_head = Config("probe/climb", race=RaceConfig(team_heads="shared"))
+    with pytest.raises(ConfigError, match="no other crossover"):
+        ablated(one_head, ["parameter-crossover"], discrete=True)
+    assert ablated(one_head, ["no-crossover"], discrete=True).race.crossover_probability == 0
     asked = Config("probe/target", race=RaceConfig(vmm_weight=0.1))
     with pytest.raises(ConfigError, match=r"--race\.vmm-weight to 0\.0, but it was set to 0\.1"):
         ablated(asked, ["vfm-only"])

@@ -31,6 +31,8 @@ from race.config.presets import resolve
 from race.config.settings import Config, RaceConfig
 from race.config.shape import shape_of
 from race.errors import ConfigError
+from race.learners.facmac import facmac
+from race.networks import factored
 from race.training.inheriting import made_to_fit
 
 P = 4
@@ -46,6 +48,12 @@ def state(config: Config) -> Any:
     return start(config)
 
 
+def start_apart(config: Config) -> Any:
+    """The same with a head for each agent."""
+    race = dataclasses.replace(config.race, team_heads="agent")
+    return start(dataclasses.replace(config, race=race))
+
+
 def test_all_agents_of_a_team_act_through_its_head(state: Any, config: Config) -> None:
     assert state.heads.shape == (P, 1, H + 1, A)
     assert len(np.unique(np.asarray(state.heads), axis=0)) == P
@@ -57,6 +65,22 @@ def test_all_agents_of_a_team_act_through_its_head(state: Any, config: Config) -
     np.testing.assert_array_equal(tested["marl"], expected[-1])
     champion = state.population.champion.heads
     np.testing.assert_array_equal(tested["champion"], np.repeat(champion, N, axis=0))
+
+
+def test_the_embedding_of_each_agent_is_that_of_the_team(state: Any, config: Config) -> None:
+    """So that it does not matter which of the two utilities see, and choosing is refused."""
+    shape = dataclasses.replace(shape_of(config), utility_embedding="agent")
+    pevfa = facmac.init_pevfa(jax.random.key(2), SPEC, shape)
+    assert pevfa.of_agents
+    agents = np.repeat(np.arange(N), A)
+    for head, alike in ((state.heads[0], True), (start_apart(config).heads[0], False)):
+        heads = jnp.broadcast_to(head, (N, *head.shape[1:]))
+        vectors = jnp.swapaxes(heads, 1, 2).reshape(-1, H + 1)
+        own, _ = factored.embedding_shifts(pevfa, vectors, agents)
+        team, _ = factored.embedding_shifts(
+            dataclasses.replace(pevfa, of_agents=False), vectors, agents
+        )
+        assert np.allclose(own, np.broadcast_to(team, own.shape), atol=1e-6) == alike
 
 
 @pytest.mark.slow

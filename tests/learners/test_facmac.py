@@ -314,8 +314,12 @@ def test_the_pevfa_hears_of_every_agents_head_on_both_ways(
 
 
 def test_utilities_may_hear_of_their_own_agents_head_alone(
-    batch: Episode, laid: Laid, now: Any, nets: Networks
+    batch: Episode, laid: Laid, now: Any, nets: Networks, config: Config
 ) -> None:
+    race = dataclasses.replace(config.race, utility_embedding="agent")
+    made = facmac.init_pevfa(KEY, SPEC, shape_of(dataclasses.replace(config, race=race)))
+    assert made.of_agents
+    assert not nets.pevfa.of_agents
     pevfa = dataclasses.replace(nets.pevfa, of_agents=True)
     value = jax.jit(partial(facmac.q_team, pevfa, now.moments, now.action, spec=SPEC))
     got = laid.steps(value(nets.heads)[0])

@@ -84,10 +84,17 @@ def test_the_pevfa_has_the_policy_embedding_as_further_inputs(
 
 
 def test_utilities_may_take_the_embedding_of_their_agents_own_head(
-    tiny_spec: EnvSpec, pevfa: Any, head: Any, inputs: tuple[jax.Array, jax.Array]
+    tiny_spec: EnvSpec,
+    tiny_config: Callable[..., Config],
+    pevfa: Any,
+    head: Any,
+    inputs: tuple[jax.Array, jax.Array],
 ) -> None:
     """Agent 0 has one action, agent 1 two; padding has no part in either embedding."""
-    own = dataclasses.replace(pevfa, of_agents=True)
+    shape = shape_of(tiny_config("race", "facmac", race={"utility_embedding": "agent"}))
+    own = enlarged(facmac.init_pevfa(jax.random.key(1), tiny_spec, shape))
+    assert own.of_agents
+    assert not pevfa.of_agents
     spoiled = head.at[0, :, 1].set(9.0)
     q = facmac.q_team(own, *inputs, spoiled, tiny_spec)
     columns = ([head[0, :, 0]], [head[1, :, 0], head[1, :, 1]])

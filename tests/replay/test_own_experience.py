@@ -122,7 +122,16 @@ def test_pieces_of_any_length_keep_whose_they_are(monkeypatch: pytest.MonkeyPatc
 
 @pytest.mark.parametrize(
     ("share", "n_own", "expected"),
-    [(0.5, 4, 3), (0.5, 2, 2), (0.25, 6, 2), (0.0, 8, 4), (1.0, 8, 6), (0.0, 0, 0), (1.0, 10, 6)],
+    [
+        (0.5, 4, 3),
+        (0.5, 2, 2),
+        (0.25, 6, 2),
+        (0.3, 5, 2),
+        (0.0, 8, 4),
+        (1.0, 8, 6),
+        (0.0, 0, 0),
+        (1.0, 10, 6),
+    ],
 )
 def test_episodes_are_drawn_without_replacement(share: float, n_own: int, expected: int) -> None:
     """Six of ten; where one kind has too few, the other fills up."""

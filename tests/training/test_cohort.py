@@ -279,6 +279,9 @@ def test_runs_of_one_kind_differ_in_numbers_alone() -> None:
         dataclasses.replace(config, task="probe/target"),
         continuous(algo="matd3"),
         dataclasses.replace(config, race=dataclasses.replace(config.race, fitness_episodes=2)),
+        dataclasses.replace(
+            config, race=dataclasses.replace(config.race, population_actions="sampled")
+        ),
         dataclasses.replace(config, env=dataclasses.replace(config.env, retries=7)),
     ):
         assert kind_of(other) != kind_of(config)
