@@ -77,7 +77,7 @@ def shown(document: Path) -> list[str]:
 
 
 TUTORIALS = tuple(sorted((ROOT / "docs/tutorials").glob("*.md")))
-LONG = (ROOT / "docs/runs.md", ROOT / "results/README.md", *TUTORIALS)
+LONG = (ROOT / "docs/runs.md", ROOT / "docs/micro.md", ROOT / "results/README.md", *TUTORIALS)
 """Documents whose commands take a minute and more."""
 
 

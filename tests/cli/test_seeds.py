@@ -57,6 +57,7 @@ def test_each_seed_is_the_run_it_is_alone(both: Path, tmp_path: Path) -> None:
     assert command == sys.argv
 
 
+@pytest.mark.slow
 def test_finished_seeds_are_extended_as_a_whole(
     both: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -168,9 +168,9 @@ def end_after(reports: int, how: str) -> Report:
     ("algo", "task", "how"),
     [
         ("race", "probe/lives", "kill"),
-        ("race", "probe/lives", "interrupt"),
-        ("race", ON_HOST, "kill"),
-        ("facmac", "probe/lives", "kill"),
+        pytest.param("race", "probe/lives", "interrupt", marks=pytest.mark.slow),
+        pytest.param("race", ON_HOST, "kill", marks=pytest.mark.slow),
+        pytest.param("facmac", "probe/lives", "kill", marks=pytest.mark.slow),
         ("facmac", ON_HOST, "interrupt"),
     ],
 )
@@ -190,7 +190,7 @@ def test_a_run_ended_again_and_again_is_the_uninterrupted_run(
     assert_same(final(tmp_path), final(whole))
 
 
-@pytest.mark.parametrize("algo", ["race", "facmac"])
+@pytest.mark.parametrize("algo", [pytest.param("race", marks=pytest.mark.slow), "facmac"])
 def test_runs_on_host_and_device_are_the_same(
     uninterrupted: Callable[[str, str], Path], algo: str
 ) -> None:
@@ -236,7 +236,10 @@ def test_all_steps_of_all_teams_count(tmp_path: Path) -> None:
     assert progress.random_steps == 0
 
 
-@pytest.mark.parametrize(("algo", "batch", "ratio"), [("race", 8, 0.3), ("facmac", 4, 1.0)])
+@pytest.mark.parametrize(
+    ("algo", "batch", "ratio"),
+    [pytest.param("race", 8, 0.3, marks=pytest.mark.slow), ("facmac", 4, 1.0)],
+)
 def test_gradient_steps_begin_with_the_first_minibatch(
     tmp_path: Path, algo: str, batch: int, ratio: float
 ) -> None:
