@@ -1,9 +1,16 @@
 """Whole runs in a directory, and what they wrote."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pytest
+
 from race.config.settings import Config
+from race.rollouts.base import Play
+from race.rollouts.discrete import EpisodeRollouts
+from race.rollouts.transitions import TransitionRollouts
 from race.runs import directory as run_directory
 from race.runs import metrics
 from race.training.run import Report, silent
@@ -30,3 +37,21 @@ def run(path: Path, config: Config, report: Report = silent) -> Progress:
     if not (path / "config.json").exists():
         run_directory.create(path, config)
     return train(path, config, report=report)
+
+
+def watch_rollouts(
+    monkeypatch: pytest.MonkeyPatch, note: Callable[[Play, np.ndarray, Any], None]
+) -> None:
+    """Tells of all that runs play: what was asked for, the teams' heads, what it came to."""
+    for kind in (TransitionRollouts, EpisodeRollouts):
+        usual = kind.play
+
+        def play(self: Any, plays: Sequence[Play], usual: Any = usual) -> list[Any]:
+            # Taken now: programs that learn write over them.
+            heads = [np.array(play.teams.heads) for play in plays]
+            results: list[Any] = usual(self, plays)
+            for one, head, (_, made) in zip(plays, heads, results, strict=True):
+                note(one, head, made)
+            return results
+
+        monkeypatch.setattr(kind, "play", play)

@@ -298,9 +298,8 @@ def train_policies(
         # Beyond the paper, whose population evolves alone. A memory of gradients would be another
         # team's after evolution, so that there is none.
         def climb(head: Float[Array, "_ H1 A"], gradient: Any) -> Any:
-            if shape.teams_per_batch > 1:  # it has its share of the mean over teams alone
-                gradient = shape.teams_per_batch * gradient
-            return descend_plainly(head, gradient, hyper.head_learning_rate, hyper.gradient_clip)
+            whole = shape.teams_per_batch * gradient  # of the mean over teams it has its share
+            return descend_plainly(head, whole, hyper.head_learning_rate, hyper.gradient_clip)
 
         own = _of_each(climb, shape)(own, of_team)
     rates = Policies(

@@ -117,7 +117,7 @@ def _roll_out(
             continue
         replay, played = result
         state = noted(runs[c], states[c]._replace(replay=replay), played)
-        after[c] = state if state.progress.played else evolve(runs[c], state)
+        after[c] = evolve(runs[c], state)
         jax.block_until_ready(replay)
         runs[c].clock.rolled_out()
     return after

@@ -66,12 +66,13 @@ def to_play(run: Run, state: RunState) -> Play:
     teams = teams.again(config.race.fitness_episodes, n_marl)
     teams = dataclasses.replace(teams, scaling=state.scaling)
     if config.in_turns:
-        one, own = teams.at(slice(turn, turn + 1)), int(turn >= teams.count - n_marl)
-        now, replay = progress.env_steps, state.replay
-        return Play(config, one, own, generation, now, replay, turn=turn, turns=config.n_teams)
+        n_marl = int(turn >= teams.count - n_marl)
+        teams = teams.at(slice(turn, turn + 1))
     judged_early = teams.count > n_marl and _surrogate_due(config, progress)
     steps = config.race.surrogate_steps if judged_early else None
-    return Play(config, teams, n_marl, generation, progress.env_steps, state.replay, steps)
+    turns = config.n_teams if config.in_turns else 1
+    env_steps, replay = progress.env_steps, state.replay
+    return Play(config, teams, n_marl, generation, env_steps, replay, steps, turn, turns)
 
 
 def _marl_alone(config: Config, progress: Progress) -> bool:
@@ -169,8 +170,8 @@ def _observed(state: RunState, now: Observed | None) -> RunState:
 
 
 def evolve(run: Run, state: RunState) -> RunState:
-    """Line 9: the population evolves by the fitness just measured."""
-    if not state.progress.fitness:
+    """Line 9: the population evolves by the fitness just measured, once all have played."""
+    if state.progress.played or not state.progress.fitness:
         return state
     fitness = jnp.asarray(state.progress.fitness, jnp.float32)
     key = jax.random.fold_in(

@@ -99,6 +99,21 @@ def assert_near(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> 
                 assert type(one[name]) is type(value), name
 
 
+def assert_as_alone(path: Path, config: Config, batching: Batching, *, exactly: bool) -> None:
+    """Two runs in lockstep write what each writes by itself, to the bit or up to rounding."""
+    made = [dataclasses.replace(config, seed=seed) for seed in (1, 2)]
+    results = train_all(path / "together", made, batching)
+    assert [type(result) for result in results] == [Progress, Progress]
+    for one in made:
+        run(path / f"{one.seed}", one)
+        found = rows(path / "together" / f"seed{one.seed}")
+        expected = rows(path / f"{one.seed}")
+        if exactly:
+            assert found == expected
+        else:
+            assert_near(found, expected)
+
+
 KINDS = ["race", pytest.param("discrete", marks=pytest.mark.slow)]
 
 

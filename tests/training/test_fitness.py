@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,21 +10,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_cohort import assert_near, train_all
+from test_cohort import assert_as_alone
 from test_laws import POPULATION, check_resumption, check_rows, small
-from whole_runs import rows, run
+from whole_runs import rows, run, watch_rollouts
 
 from race.algorithms.base import Teams
 from race.config.cohort import Batching
-from race.errors import ConfigError, DivergenceError
-from race.replay.buffer import Replay
-from race.rollouts.base import Generation, Play
-from race.rollouts.discrete import EpisodeRollouts
-from race.rollouts.transitions import TransitionRollouts
+from race.errors import ConfigError
 from race.runs import checkpoints
 from race.training import learning
 from race.training.fitness import known_returns, means
-from race.training.run_state import Progress
 
 # --- which returns count ----------------------------------------------------------------------
 
@@ -88,17 +82,7 @@ def returned(monkeypatch: pytest.MonkeyPatch) -> list[list[float]]:
     monkeypatch.setattr(learning, "CHUNK", 7)
     monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
     found: list[list[float]] = []
-    for kind in (TransitionRollouts, EpisodeRollouts):
-        usual = kind.play
-
-        def play(
-            self: Any, plays: Sequence[Play], usual: Any = usual
-        ) -> list[tuple[Replay, Generation] | DivergenceError]:
-            results: list[Any] = usual(self, plays)
-            found.extend(generation.episode_return.tolist() for _, generation in results)
-            return results
-
-        monkeypatch.setattr(kind, "play", play)
+    watch_rollouts(monkeypatch, lambda _, __, made: found.append(made.episode_return.tolist()))
     return found
 
 
@@ -243,19 +227,7 @@ def test_runs_of_a_cohort_are_judged_as_alone(
 ) -> None:
     base = "facmac" if task == "probe/lives" else "matd3"
     config = small(algo, base, task, fitness_episodes=2, fitness_generations=2)
-    made = [dataclasses.replace(config, seed=seed) for seed in (1, 2)]
-    results = train_all(tmp_path / "together", made, batching)
-    assert [type(result) for result in results] == [Progress, Progress]
-    for one in made:
-        run(tmp_path / f"{one.seed}", one)
-        found, expected = (
-            rows(tmp_path / "together" / f"seed{one.seed}"),
-            rows(tmp_path / f"{one.seed}"),
-        )
-        if batching == "map" or algo == "ea":
-            assert found == expected
-        else:
-            assert_near(found, expected)
+    assert_as_alone(tmp_path, config, batching, exactly=batching == "map" or algo == "ea")
 
 
 # --- what is refused --------------------------------------------------------------------------

@@ -1,25 +1,19 @@
 """Teams that play one after the other, with the gradient steps that each owes in between."""
 
 import dataclasses
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from test_cohort import assert_near, train_all
+from test_cohort import assert_as_alone
 from test_laws import POPULATION, check_resumption, check_rows, small
-from whole_runs import rows, run
+from whole_runs import rows, run, watch_rollouts
 
 from race import programs
 from race.config.cohort import Batching
 from race.errors import ConfigError
-from race.replay.buffer import Replay
-from race.rollouts.base import Generation, Play
-from race.rollouts.discrete import EpisodeRollouts
-from race.rollouts.transitions import TransitionRollouts
 from race.training import learning
-from race.training.run_state import Progress
 
 Told = list[tuple[str, Any]]
 
@@ -28,19 +22,7 @@ Told = list[tuple[str, Any]]
 def told(monkeypatch: pytest.MonkeyPatch) -> Told:
     """What happens, in order: who plays and what it returns, gradient steps, evolution."""
     found: Told = []
-    for kind in (TransitionRollouts, EpisodeRollouts):
-        usual = kind.play
-
-        def play(
-            self: Any, plays: Sequence[Play], usual: Any = usual
-        ) -> list[tuple[Replay, Generation]]:
-            heads = [np.asarray(play.teams.heads) for play in plays]
-            results: list[tuple[Replay, Generation]] = usual(self, plays)
-            for one, head, (_, made) in zip(plays, heads, results, strict=True):
-                found.append(("play", (one, head, made)))
-            return results
-
-        monkeypatch.setattr(kind, "play", play)
+    watch_rollouts(monkeypatch, lambda *played: found.append(("play", played)))
     learned, evolved = programs.learn, programs.evolve
 
     def learn(*args: Any, **more: Any) -> Any:
@@ -131,9 +113,6 @@ def test_each_episode_is_learned_from_before_the_next(
     assert [what for what, _ in told].count("evolve") == sum("teams" in r for r in generations)
     if not race:
         check_rows(tmp_path / "whole", config, progress)
-    monkeypatch.undo()
-    monkeypatch.setattr(learning, "CHUNK", 7)
-    monkeypatch.setattr(learning, "EPISODES_CHUNK", 2)
     check_resumption(tmp_path, config)
 
 
@@ -141,17 +120,7 @@ def test_each_episode_is_learned_from_before_the_next(
 @pytest.mark.parametrize("batching", ["map", "vmap"])
 def test_runs_of_a_cohort_take_turns_as_alone(tmp_path: Path, batching: Batching) -> None:
     config = small("merl", "matd3", "probe/terminates", learn_after="episode")
-    made = [dataclasses.replace(config, seed=seed) for seed in (1, 2)]
-    results = train_all(tmp_path / "together", made, batching)
-    assert [type(result) for result in results] == [Progress, Progress]
-    for one in made:
-        run(tmp_path / f"{one.seed}", one)
-        found = rows(tmp_path / "together" / f"seed{one.seed}")
-        (assert_near if batching == "vmap" else assert_same)(found, rows(tmp_path / f"{one.seed}"))
-
-
-def assert_same(found: list[dict[str, Any]], expected: list[dict[str, Any]]) -> None:
-    assert found == expected
+    assert_as_alone(tmp_path, config, batching, exactly=batching == "map")
 
 
 @pytest.mark.parametrize(
